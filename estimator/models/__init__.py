@@ -1,0 +1,1 @@
+"""Physics as pure CasADi functions: rotations, frames, motion, measurements."""

@@ -1,0 +1,1 @@
+"""Guidance: kinematics, closed-form slews, the slew optimal control problem, scans, surveys, exports."""
