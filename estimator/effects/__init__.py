@@ -7,8 +7,21 @@ from estimator.effects.declaration import (
     Layout,
     Parameter,
     Sample,
+    axes,
+    declare,
     register,
     registry,
 )
 
-__all__ = ["ENVIRONMENT", "Effect", "EffectInstance", "Layout", "Parameter", "Sample", "register", "registry"]
+__all__ = [
+    "ENVIRONMENT",
+    "Effect",
+    "EffectInstance",
+    "Layout",
+    "Parameter",
+    "Sample",
+    "axes",
+    "declare",
+    "register",
+    "registry",
+]

@@ -17,7 +17,10 @@ Contributions by channel:
 ========================  =========================================================================================
 
 An effect of the torque or command channel may carry internal states (a flexible mode, a lag): ``state_size`` and
-``state_derivative`` say how they move; they start at zero at the start of each rotation arc.
+``state_derivative`` say how they move; they start at zero at the start of each rotation arc. The engine advances them
+with the attitude by classical fourth-order Runge-Kutta steps inside which the command is constant.
+
+An effect with one instance and no states is declared and registered in one call of :func:`declare`.
 """
 
 from __future__ import annotations
@@ -66,6 +69,8 @@ class Layout:
         span: first and last time of all data, s after the epoch.
         orbital_period: s.
         tracker_span: first and last time of star tracker data, s.
+        beam_directions: (beams) unit vectors in antenna axes, their mean where they vary; empty where not known.
+        tracker_boresight: line of sight of the star tracker, unit vector in tracker axes.
     """
 
     beams: int
@@ -73,6 +78,8 @@ class Layout:
     span: tuple[float, float]
     orbital_period: float
     tracker_span: tuple[float, float]
+    beam_directions: tuple[tuple[float, float, float], ...] = ()
+    tracker_boresight: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -100,6 +107,8 @@ class Sample:
         other_torque: N m, tracker axes: all torques of stateless effects and the command, and minus the gyroscopic
             term, so that a coupled mode can form the rigid angular acceleration (state-carrying torque effects).
         state: the effect's own internal states (state_size).
+        step: length of the Runge-Kutta step in progress, s (state-carrying effects).
+        step_fraction: place of this evaluation inside that step, 0 at its start, 1 at its end (state-carrying effects).
         antenna_from_tracker: quaternion (4) (doppler channel).
         beam_direction: (beams, 3) unit vectors, antenna axes (doppler channel).
         carrier_frequency: Hz (doppler channel).
@@ -125,6 +134,8 @@ class Sample:
     command: Matrix = None
     other_torque: Matrix = None
     state: Matrix = None
+    step: Matrix = None
+    step_fraction: Matrix = None
     antenna_from_tracker: Matrix = None
     beam_direction: Matrix = None
     carrier_frequency: Matrix = None
@@ -185,12 +196,14 @@ class Effect:
         channel: the residual or equation that it changes.
         summary: one sentence for the generated documentation page.
         instances: from the layout of a campaign to the instances that exist on it (usually one).
+        formula: the contribution as text, for the documentation page.
     """
 
     name: str
     channel: Channel
     summary: str
     instances: Callable[[Layout], tuple[EffectInstance, ...]]
+    formula: str = ""
 
 
 _REGISTRY: dict[str, Effect] = {}
@@ -211,3 +224,29 @@ def register(effect: Effect) -> Effect:
 def registry() -> dict[str, Effect]:
     """The registered effects by name, in alphabetical order (a copy)."""
     return dict(sorted(_REGISTRY.items()))
+
+
+def axes(name: str, unit: str, scale: float, largest: float, labels: tuple[str, ...] = ("x", "y", "z")
+         ) -> tuple[Parameter, ...]:
+    """One :class:`Parameter` per axis, ``name_x`` and so on, plausible between ``-largest`` and ``largest``."""
+    return tuple(Parameter(f"{name}_{label}", unit, scale, (-largest, largest)) for label in labels)
+
+
+def declare(name: str, channel: Channel, parameters: tuple[Parameter, ...], function: Callable[[Sample, Any], Any], *,
+            summary: str, formula: str, zero: str, reference: str, state_size: int = 0,
+            state_derivative: Callable[[Sample, Any], Any] | None = None) -> Effect:
+    """Declare and register an effect that has one instance, the same on every campaign.
+
+    Args:
+        name, channel, parameters, function, zero, reference, state_size, state_derivative: see :class:`EffectInstance`.
+        summary, formula: see :class:`Effect`.
+
+    Raises:
+        ValueError: an effect of that name is registered already.
+    """
+    instance = EffectInstance(name, name, channel, parameters, function, zero, reference, state_size, state_derivative)
+
+    def instances(layout: Layout) -> tuple[EffectInstance, ...]:
+        return (instance,)
+
+    return register(Effect(name, channel, summary, instances, formula))
