@@ -1,0 +1,432 @@
+"""Named effects inside the simulator: their declared functions, evaluated with numbers where they act.
+
+An effect is given by its name and the values of its parameters. The contribution is the function of the declaration
+itself; everything around it (where it enters, with which attitude, rate, orbit) is the simulator's own.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from estimator.effects.declaration import ENVIRONMENT, EffectInstance, Layout, Sample, registry
+from estimator.models.compiled import Mapped
+from estimator.models.errors import NotFiniteError, RequestError
+from problems.alignment.simulation.orbit import Orbit
+
+EffectValues = float | Sequence[float] | Mapping[str, float] | None
+"""One number, one for each parameter in order, one for each parameter by name, or None for the nominal values."""
+
+_TABLE_ONLY = ("magnetic_field", "sun", "sunlit", "density", "earth_velocity")
+_STEP = 5.0  # [s] of the environment's grid; the field along an orbit bends over hundreds of seconds
+_SHADOW_STEP = 0.25  # [s] of the grid for the edge of the shadow
+
+
+@dataclass(frozen=True)
+class ActiveEffect:
+    """One instance with the values of its parameters, as a compiled-down numeric function.
+
+    Attributes:
+        instance: the declaration on this campaign.
+        values: (parameters,) in SI units, order of the declaration.
+        used: fields of the sample that the functions depend on, in the order of the function's inputs.
+        function: from those fields to the contribution and the derivative of the internal states.
+    """
+
+    instance: EffectInstance
+    values: np.ndarray
+    used: tuple[str, ...]
+    function: ca.Function
+
+    def parameters(self) -> dict[str, float]:
+        """Values by name of the parameter."""
+        return {p.name: float(v) for p, v in zip(self.instance.parameters, self.values, strict=True)}
+
+
+def parse_effects(text: str) -> dict[str, EffectValues]:
+    """Effects written as ``name=value:value,name=value`` to a mapping.
+
+    Names are separated by commas, the values of one effect by colons, in the order of its parameters and in SI
+    units; ``name`` alone stands for the values that physics demands (the scale 1 of the gravity gradient). A beam
+    is chosen by its number in the name: ``beam-mispointing:1=7e-5:-5e-5``.
+
+    Raises:
+        RequestError: a value is no number, or a name comes twice.
+    """
+    effects: dict[str, EffectValues] = {}
+    for part in filter(None, (p.strip() for p in text.split(","))):
+        name, equals, values = (x.strip() for x in part.partition("="))
+        if name in effects:
+            raise RequestError("the effect is given twice", where="effects", value=name, remedy="give it once")
+        if not equals:
+            effects[name] = None
+            continue
+        try:
+            effects[name] = tuple(float(v) for v in values.replace(";", ":").split(":"))
+        except ValueError as error:
+            raise RequestError("a value is no number", where=f"effects: {name}", value=values,
+                               remedy="write name=value or name=value:value:value") from error
+    return effects
+
+
+def activate(effects: Mapping[str | EffectInstance, EffectValues], layout: Layout) -> tuple[ActiveEffect, ...]:
+    """The effects asked for, on a campaign of this layout.
+
+    Args:
+        effects: keys are names of the library ("gravity-gradient-torque", "beam-mispointing:1"), or declarations that
+            no library holds; values see :data:`EffectValues`.
+        layout: of the campaign.
+
+    Raises:
+        RequestError: no effect of that name, a name that stands for several, or a wrong number of values.
+        NotFiniteError: a value is NaN or infinite.
+    """
+    active = []
+    for key, values in effects.items():
+        instance = key if isinstance(key, EffectInstance) else _find(key, layout)
+        active.append(_active(instance, _vector(instance, values), layout))
+    return tuple(active)
+
+
+def _find(name: str, layout: Layout) -> EffectInstance:
+    import importlib
+
+    importlib.import_module("estimator.effects")  # fills the registry
+    library = registry()
+    family = name if name in library else name.partition(":")[0]
+    if family not in library:
+        raise RequestError("there is no effect of this name", where="effects", value=name, limit=", ".join(library),
+                           remedy="choose one of these")
+    instances = library[family].instances(layout)
+    for instance in instances:
+        if instance.name == name:
+            return instance
+    if family == name and len(instances) == 1:
+        return instances[0]
+    raise RequestError("the name does not say which one", where="effects", value=name,
+                       limit=", ".join(i.name for i in instances) or "none on this campaign", remedy="choose one of these")
+
+
+def _vector(instance: EffectInstance, values: EffectValues) -> np.ndarray:
+    names = [p.name for p in instance.parameters]
+    expected = ", ".join(f"{p.name} [{p.unit}]" for p in instance.parameters)
+    if values is None:
+        if any(p.nominal is None for p in instance.parameters):
+            raise RequestError("the effect needs values", where=f"effects: {instance.name}", limit=expected,
+                               remedy="give one for each parameter")
+        numbers = [float(p.nominal) for p in instance.parameters if p.nominal is not None]
+    elif isinstance(values, Mapping):
+        if unknown := sorted(set(values) - set(names)):
+            raise RequestError("the effect has no such parameter", where=f"effects: {instance.name}", value=unknown,
+                               limit=expected)
+        numbers = [float(values.get(n, 0.0)) for n in names]
+    else:
+        numbers = [float(v) for v in np.atleast_1d(np.asarray(values, dtype=float))]
+    if len(numbers) != len(names):
+        raise RequestError("wrong number of values", where=f"effects: {instance.name}", value=len(numbers),
+                           limit=f"{len(names)}: {expected}", remedy="give one for each parameter")
+    if not all(math.isfinite(v) for v in numbers):
+        raise NotFiniteError("a value is not finite", where=f"effects: {instance.name}", value=numbers)
+    return np.array(numbers)
+
+
+def _active(instance: EffectInstance, values: np.ndarray, layout: Layout) -> ActiveEffect:
+    shapes = _shapes(layout, instance.state_size)
+    symbols = {name: ca.MX.sym(name, *shape) for name, shape in shapes.items()}
+    p = ca.DM(values)
+    outputs = [ca.densify(ca.MX(instance.function(Sample(**symbols), p)))]
+    if instance.state_size and instance.state_derivative is not None:
+        outputs.append(ca.densify(ca.MX(instance.state_derivative(Sample(**symbols), p))))
+    whole = ca.veccat(*outputs)
+    used = tuple(n for n, s in symbols.items() if n == "time" or ca.depends_on(whole, s))
+    function = ca.Function("contribution", [symbols[n] for n in used], outputs, list(used),
+                           ["contribution", "state_derivative"][: len(outputs)])
+    try:
+        function = function.expand()
+    except RuntimeError:
+        pass  # A lookup table inside: it stays as it is.
+    return ActiveEffect(instance, values, used, function)
+
+
+def _shapes(layout: Layout, states: int) -> dict[str, tuple[int, int]]:
+    shapes = {name: (size, 1) for name, size in ENVIRONMENT.items()}
+    shapes |= {"attitude": (4, 1), "rate": (3, 1), "inertia": (3, 3), "actuator_from_tracker": (4, 1),
+               "command": (3, 1), "other_torque": (3, 1), "state": (max(states, 1), 1),
+               "antenna_from_tracker": (4, 1), "beam_direction": (max(layout.beams, 1), 3),
+               "carrier_frequency": (1, 1), "inside_arc": (1, 1)}
+    declared = {f.name for f in dataclasses.fields(Sample)}
+    if missing := declared - set(shapes):
+        raise NotImplementedError(f"the simulator does not provide these fields of a sample: {sorted(missing)}")
+    return shapes
+
+
+class Environment:
+    """What an effect may ask of time and orbit, on the true orbit.
+
+    Position, velocity and what follows from them are the simulator's own; the magnetic field, the Sun, the shadow,
+    the atmosphere and the Earth's motion come from the common table.
+    """
+
+    def __init__(self, orbit: Orbit, epoch: str):
+        self.orbit = orbit
+        self.epoch = epoch
+
+    def fields(self, names: Sequence[str], time: np.ndarray) -> dict[str, np.ndarray]:
+        """Arrays (n, size) of the fields at ``time`` (n,)."""
+        position, velocity = self.orbit.inertial(time)
+        answer: dict[str, np.ndarray] = {}
+        for name in names:
+            if name == "time":
+                answer[name] = time[:, None]
+            elif name == "position":
+                answer[name] = position
+            elif name == "velocity":
+                answer[name] = velocity
+            elif name == "acceleration":
+                answer[name] = self.orbit.acceleration(position)
+            elif name == "earth_fixed_velocity":
+                answer[name] = self.orbit.relative_velocity(position, velocity)
+            elif name == "earth_angle":
+                answer[name] = self.orbit.earth_angle(time)[:, None]
+            elif name == "orbit_phase":
+                answer[name] = argument_of_latitude(position, velocity)[:, None]
+        asked = [n for n in names if n in _TABLE_ONLY]
+        if asked:
+            answer |= self._interpolated(asked, time)
+        return answer
+
+    def _interpolated(self, names: Sequence[str], time: np.ndarray) -> dict[str, np.ndarray]:
+        smooth = [n for n in names if n != "sunlit"]
+        answer: dict[str, np.ndarray] = {}
+        if smooth:
+            if len(time) > 8 and (time[-1] - time[0]) / _STEP < len(time):
+                count = max(int(math.ceil((time.max() - time.min()) / _STEP)) + 1, 4)
+                grid = np.linspace(time.min(), max(time.max(), time.min() + 1.0), count)
+            else:
+                grid = time
+            table = self._table(grid)
+            for name in smooth:
+                values = np.asarray(table[name], dtype=float).reshape(len(grid), -1)
+                answer[name] = values if grid is time else CubicSpline(grid, values)(time)
+        if "sunlit" in names:
+            answer["sunlit"] = np.asarray(self._table(time)["sunlit"], dtype=float).reshape(len(time), 1)
+        return answer
+
+    def _table(self, time: np.ndarray) -> dict[str, np.ndarray]:
+        from estimator.models.environment import environment_table
+
+        position, velocity = self.orbit.inertial(time)
+        return environment_table(self.epoch, time, position, velocity, self.orbit.earth_rotation_angle_at_epoch,
+                                 self.orbit.earth_rotation_rate)
+
+    def along_arc(self, names: Sequence[str], start: float, stop: float) -> Any:
+        """A function from one time to the fields (dict of arrays) for the right side of the rotation."""
+        smooth = [n for n in names if n not in ("time", "sunlit")]
+        grid = np.linspace(start, stop, max(int(math.ceil((stop - start) / _STEP)) + 1, 4))
+        columns, places = [], {}
+        if smooth:
+            table = self.fields(smooth, grid)
+            width = 0
+            for name in smooth:
+                values = table[name]
+                if name == "orbit_phase":
+                    values = np.unwrap(values, axis=0)
+                places[name] = slice(width, width + values.shape[1])
+                width += values.shape[1]
+                columns.append(values)
+            spline = CubicSpline(grid, np.concatenate(columns, axis=1))
+        if "sunlit" in names:
+            fine = np.linspace(start, stop, int(math.ceil((stop - start) / _SHADOW_STEP)) + 1)
+            light = self.fields(["sunlit"], fine)["sunlit"][:, 0]
+
+        def at(time: float) -> dict[str, Any]:
+            answer: dict[str, Any] = {"time": time}
+            if smooth:
+                row = spline(time)
+                for name, place in places.items():
+                    answer[name] = row[place]
+            if "sunlit" in names:
+                answer["sunlit"] = float(np.interp(time, fine, light))
+            return answer
+
+        return at
+
+
+def argument_of_latitude(position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    """Angle along the orbit from the ascending node (n,) rad in [0, 2 pi)."""
+    normal = np.cross(position, velocity)
+    node = np.stack([-normal[:, 1], normal[:, 0], np.zeros(len(normal))], axis=1)
+    across = np.cross(normal, node)
+    angle = np.arctan2(np.sum(position * across, axis=1) / np.linalg.norm(normal, axis=1),
+                       np.sum(position * node, axis=1))
+    return np.mod(angle, 2.0 * np.pi)
+
+
+def contributions(
+    effects: Sequence[ActiveEffect],
+    environment: Environment,
+    time: np.ndarray,
+    width: int,
+    constant: Mapping[str, np.ndarray],
+    sampled: Mapping[str, np.ndarray],
+) -> np.ndarray:
+    """Sum of the contributions (n, width) of effects of one measurement channel.
+
+    Args:
+        effects: of that channel.
+        environment: of the campaign.
+        time: (n,) s after the epoch.
+        width: of one contribution.
+        constant: fields that are the same for all samples.
+        sampled: fields given sample by sample (attitude, rate, inside_arc).
+    """
+    total = np.zeros((len(time), width))
+    for effect in effects:
+        shared = tuple(n for n in effect.used if n in constant)
+        mapped = Mapped(effect.function, shared=shared)
+        for first in range(0, len(time), 50_000):
+            part = slice(first, min(first + 50_000, len(time)))
+            fields = environment.fields([n for n in effect.used if n in ENVIRONMENT], time[part])
+            for name in effect.used:
+                if name in constant:
+                    fields[name] = constant[name]
+                elif name in sampled:
+                    fields[name] = sampled[name][part]
+            total[part] += mapped(part.stop - first, **fields)[0].reshape(-1, width)
+    return total
+
+
+class TorqueEffects:
+    """All effects that act on the rotation of the body, in one right side.
+
+    Order: effects on the command change the commanded torque; stateless torques are added; then effects with
+    internal states see the sum of all these minus the gyroscopic term as ``other_torque``.
+
+    Args:
+        effects: those of the channels torque and command; others are passed over.
+        environment: of the campaign.
+        inertia: (3, 3) kg m2.
+        tracker_from_actuator: (3, 3).
+        actuator_from_tracker: (4) the same as a quaternion.
+    """
+
+    def __init__(self, effects: Sequence[ActiveEffect], environment: Environment, inertia: np.ndarray,
+                 tracker_from_actuator: np.ndarray, actuator_from_tracker: np.ndarray):
+        mine = [e for e in effects if e.instance.channel in ("command", "torque")]
+        self.command = [e for e in mine if e.instance.channel == "command"]
+        self.free = [e for e in mine if e.instance.channel == "torque" and e.instance.state_size == 0]
+        self.coupled = [e for e in mine if e.instance.channel == "torque" and e.instance.state_size > 0]
+        self.states = sum(e.instance.state_size for e in mine)
+        self.environment = environment
+        self.inertia = inertia
+        self.tracker_from_actuator = tracker_from_actuator
+        self.constant = {"inertia": inertia, "actuator_from_tracker": actuator_from_tracker}
+
+    def law(self, start: float, stop: float) -> Any:
+        """The torque law of one arc, see :data:`problems.alignment.simulation.rotation.TorqueLaw`."""
+        every = [*self.command, *self.free, *self.coupled]
+        if not every:
+            nothing = np.zeros(0)
+            turn = self.tracker_from_actuator
+            return lambda _time, _matrix, _rate, command, _internal: (turn @ command, nothing)
+        names = [n for n in ENVIRONMENT if any(n in e.used for e in every)]
+        at = self.environment.along_arc(names, start, stop)
+        calls = {id(e): _Call(e, self.constant) for e in every}
+        places, first = {}, 0
+        for e in every:
+            places[id(e)] = slice(first, first + e.instance.state_size)
+            first += e.instance.state_size
+        wants_attitude = any("attitude" in e.used for e in every)
+
+        def law(time: float, matrix: np.ndarray, rate: np.ndarray, command: np.ndarray,
+                internal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            fields = at(time)
+            fields["rate"], fields["command"] = rate, command
+            if wants_attitude:
+                fields["attitude"] = _quaternion(matrix.T)
+            derivative = np.empty(self.states)
+
+            def add(effect: ActiveEffect, total: np.ndarray) -> np.ndarray:
+                place = places[id(effect)]
+                if effect.instance.state_size:
+                    fields["state"] = internal[place]
+                value, slope = calls[id(effect)](fields)
+                if effect.instance.state_size:
+                    derivative[place] = slope
+                return total + value
+
+            acting = command
+            for effect in self.command:
+                acting = add(effect, acting)
+            torque = self.tracker_from_actuator @ acting
+            for effect in self.free:
+                torque = add(effect, torque)
+            if self.coupled:
+                fields["other_torque"] = torque - np.cross(rate, self.inertia @ rate)
+                for effect in self.coupled:
+                    torque = add(effect, torque)
+            return torque, derivative
+
+        return law
+
+    def command_map(self) -> np.ndarray:
+        """Lasting map (3, 3) from command (actuator axes) to torque (tracker axes), with stateless command effects."""
+        columns = []
+        for axis in range(3):
+            command = np.eye(3)[axis]
+            acting = command.copy()
+            for effect in self.command:
+                if effect.instance.state_size == 0:
+                    fields = {n: np.zeros(effect.function.numel_in(n)) for n in effect.used}
+                    call = _Call(effect, self.constant)
+                    base, _ = call({**fields, "command": np.zeros(3)})
+                    base = base.copy()
+                    value, _ = call({**fields, "command": command})
+                    acting = acting + value - base
+            columns.append(self.tracker_from_actuator @ acting)
+        return np.stack(columns, axis=1)
+
+
+class _Call:
+    """One effect's function on numbers, through CasADi's buffers (a call costs a few microseconds)."""
+
+    def __init__(self, effect: ActiveEffect, constant: Mapping[str, np.ndarray]):
+        function = effect.function
+        self.buffer, self.trigger = function.buffer()
+        self.inputs: dict[str, np.ndarray] = {}
+        self.varying = [n for n in effect.used if n not in constant]
+        for i, name in enumerate(effect.used):
+            array = np.zeros(function.numel_in(i))
+            if name in constant:
+                array[:] = np.asarray(constant[name], dtype=float).ravel(order="F")
+            self.inputs[name] = array
+            self.buffer.set_arg(i, memoryview(array))
+        self.outputs = [np.zeros(function.numel_out(i)) for i in range(function.n_out())]
+        for i, array in enumerate(self.outputs):
+            self.buffer.set_res(i, memoryview(array))
+
+    def __call__(self, fields: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray | None]:
+        for name in self.varying:
+            self.inputs[name][:] = fields[name]
+        self.trigger()
+        return self.outputs[0], self.outputs[1] if len(self.outputs) > 1 else None
+
+
+def _quaternion(matrix: np.ndarray) -> np.ndarray:
+    """Unit quaternion (4) ``x_from_y``, scalar first, of the matrix x_from_y (3, 3), by its largest component."""
+    m = matrix
+    trace = m[0, 0] + m[1, 1] + m[2, 2]
+    squares = np.array([1.0 + trace, 1.0 + 2.0 * m[0, 0] - trace, 1.0 + 2.0 * m[1, 1] - trace, 1.0 + 2.0 * m[2, 2] - trace])
+    largest = int(np.argmax(squares))
+    a, b, c = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+    d, e, f = m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1]
+    rows = ((squares[0], a, b, c), (a, squares[1], d, e), (b, d, squares[2], f), (c, e, f, squares[3]))
+    quaternion = np.array(rows[largest])
+    return quaternion / np.linalg.norm(quaternion)

@@ -1,0 +1,123 @@
+"""The true rotation of the rigid body in a free or torque arc.
+
+State: the matrix ``inertial_from_tracker`` (9), the angular momentum in inertial axes (3), then the internal states of
+effects. Without torque the momentum stays constant to the last bit, and the rate follows from it:
+``w = J^-1 R' L``, ``R' = R [w x]``, ``L' = R torque``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+TorqueLaw = Callable[[float, np.ndarray, np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""(time, inertial_from_tracker (3, 3), rate (3), commanded torque (3) in actuator axes, internal states) to the torque
+in tracker axes (3) N m and the derivative of the internal states."""
+
+
+@dataclass(frozen=True)
+class RotationArc:
+    """The solution of one arc.
+
+    Attributes:
+        start, stop: s after the epoch.
+        inertia: (3, 3) kg m2, tracker axes.
+        pieces: (start, stop, dense output), in order; the command is constant inside a piece.
+    """
+
+    start: float
+    stop: float
+    inertia: np.ndarray
+    pieces: tuple[tuple[float, float, Callable[[np.ndarray], np.ndarray]], ...]
+
+    def state(self, time: np.ndarray) -> np.ndarray:
+        """Whole state (n, 12 + internal) at ``time`` (n,), which may leave the arc by a little."""
+        time = np.asarray(time, dtype=float)
+        result = np.empty((len(time), len(self.pieces[0][2](np.array([self.start])))))
+        for k, (start, stop, solution) in enumerate(self.pieces):
+            inside = np.ones(len(time), dtype=bool)
+            if k > 0:
+                inside &= time >= start
+            if k < len(self.pieces) - 1:
+                inside &= time < stop
+            if inside.any():
+                result[inside] = solution(time[inside]).T
+        return result
+
+    def __call__(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """``tracker_from_inertial`` matrices (n, 3, 3) and rates (n, 3) rad/s of the body in tracker axes."""
+        state = self.state(time)
+        attitude = np.swapaxes(state[:, :9].reshape(-1, 3, 3), 1, 2)
+        rate = np.linalg.solve(self.inertia, (attitude @ state[:, 9:12, None])[:, :, 0].T).T
+        return attitude, rate
+
+
+def integrate_arc(
+    start: float,
+    stop: float,
+    inertial_from_tracker: np.ndarray,
+    rate: np.ndarray,
+    inertia: np.ndarray,
+    segments: list[tuple[float, float, np.ndarray]],
+    torque_law: TorqueLaw,
+    internal_states: int,
+) -> RotationArc:
+    """Integrate one arc, anew at every switch of the command.
+
+    Args:
+        start, stop: s after the epoch.
+        inertial_from_tracker, rate: (3, 3) and (3) rad/s (tracker axes) at the start.
+        inertia: (3, 3) kg m2.
+        segments: (start, stop, command (3) N m in actuator axes), in order and apart.
+        torque_law: see :data:`TorqueLaw`.
+        internal_states: how many; they start at zero.
+    """
+    inverse = np.linalg.inv(inertia)
+    momentum = inertial_from_tracker @ inertia @ rate
+    state = np.concatenate([inertial_from_tracker.ravel(), momentum, np.zeros(internal_states)])
+    scale = max(float(np.linalg.norm(momentum)), float(np.trace(inertia)) * 1e-5)
+    tolerance = np.concatenate([np.full(9, 1e-12), np.full(3, 1e-12 * scale), np.full(internal_states, 1e-10)])
+    switches = [start, stop]
+    for first, last, _ in segments:
+        switches += [t for t in (first, last) if start < t < stop]
+    switches = sorted(set(switches))
+    pieces = []
+    for first, last in zip(switches[:-1], switches[1:], strict=True):
+        middle = 0.5 * (first + last)
+        command = sum((c for a, b, c in segments if a <= middle < b), np.zeros(3))
+
+        def derivative(time: float, state: np.ndarray, command: np.ndarray = command) -> np.ndarray:
+            matrix = state[:9].reshape(3, 3)
+            body_rate = inverse @ (state[9:12] @ matrix)
+            x, y, z = body_rate.tolist()
+            torque, internal = torque_law(time, matrix, body_rate, command, state[12:])
+            result = np.empty_like(state)
+            cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+            result[:9] = (matrix @ cross).ravel()
+            result[9:12] = matrix @ torque
+            result[12:] = internal
+            return result
+
+        solution = solve_ivp(derivative, (first, last), state, method="DOP853", rtol=1e-12, atol=tolerance,
+                             dense_output=True)
+        if not solution.success:
+            raise ArithmeticError(f"the rotation arc at {first:.1f} s could not be integrated: {solution.message}")
+        pieces.append((first, last, solution.sol))
+        state = solution.y[:, -1]
+    return RotationArc(start, stop, inertia, tuple(pieces))
+
+
+def moving_body(inertia: np.ndarray, spread: float, draw: np.random.Generator) -> np.ndarray:
+    """A tensor (3, 3) kg m2 near ``inertia`` that is that of a body whatever the spread.
+
+    The second moments of mass, ``trace(J)/2 - J``, are stretched by a random matrix near 1; they stay positive, so
+    the new tensor keeps the triangle inequality.
+    """
+    moments = 0.5 * np.trace(inertia) * np.eye(3) - inertia
+    stretch = np.eye(3) + spread * draw.standard_normal((3, 3))
+    moments = stretch @ moments @ stretch.T
+    tensor = np.trace(moments) * np.eye(3) - moments
+    return 0.5 * (tensor + tensor.T)
