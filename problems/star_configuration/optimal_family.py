@@ -68,10 +68,7 @@ def signature(request: Request, directions: np.ndarray) -> np.ndarray:
     """
     first, second = np.triu_indices(len(directions), 1)
     parts = [np.sort(np.abs((directions @ directions.T)[first, second]))]
-    marks = [np.array(f) for f in request.fixed] + [np.array(c.direction) for c in request.keep_outs]
-    if request.criterion == "K1":
-        marks.append(np.array(request.axis))
-    parts += [np.sort(np.abs(directions @ mark)) for mark in marks]
+    parts += [np.sort(np.abs(directions @ mark)) for mark in _marks(request)]
     return np.concatenate(parts)
 
 
@@ -92,7 +89,22 @@ def family_dimension(request: Request, optimum: LocalOptimum) -> int:
     if free.shape[1] == 0:
         return 0
     curvature = np.linalg.eigvalsh(free.T @ hessian @ free)
-    return int(np.sum(np.abs(curvature) < _FLAT * max(float(np.max(np.abs(hessian))), 1.0)))
+    flat = int(np.sum(np.abs(curvature) < _FLAT * max(float(np.max(np.abs(hessian))), 1.0)))
+    return max(0, flat - _unfixed_rotations(request))
+
+
+def _unfixed_rotations(request: Request) -> int:
+    """Rotations that leave the request alike and that its program does not fix: one if all its marks share a line."""
+    if request.isotropic:
+        return 0
+    marks = _marks(request)
+    return int(np.linalg.matrix_rank(np.array(marks), tol=1e-9) == 1)
+
+
+def _marks(request: Request) -> list[np.ndarray]:
+    """Everything in the request that singles out a direction: fixed sensors, cones, the axis of K1."""
+    marks = [np.array(f) for f in request.fixed] + [np.array(c.direction) for c in request.keep_outs]
+    return [*marks, np.array(request.axis)] if request.criterion == "K1" else marks
 
 
 def optimal_family(request: Request, *, starts: int = 40, seed: int = 0) -> OptimalFamily:
