@@ -183,15 +183,23 @@ def _table_records(text: str, file: Path) -> list[Mapping[str, Any]]:
 
 def _column(names: Sequence[str], kind: str) -> str | None:
     """The first column of the file that holds ``kind``, in the order of preference of the aliases."""
-    lowered = {name.strip().lower(): name for name in reversed(names)}
+    lowered = {name.strip().lower(): name for name in names}
     # A column that states its unit goes before one that leaves it open.
     aliases = sorted(_COLUMNS[kind], key=lambda a: a not in _IN_RADIANS | _IN_HOURS and not a.endswith("_deg"))
     return next((lowered[a] for a in aliases if a in lowered), None)
 
 
+def _fullest_identifier(records: list[Mapping[str, Any]], names: Sequence[str]) -> str | None:
+    """The identifier column that the most records fill; the order of preference decides a tie."""
+    lowered = {name.strip().lower(): name for name in names}
+    present = [lowered[a] for a in _COLUMNS["identifier"] if a in lowered]
+    return max(present, key=lambda c: sum(not _missing(r.get(c)) for r in records), default=None)
+
+
 def _catalogue(records: list[Mapping[str, Any]], file: Path, unit: str | None) -> StarCatalogue:
     names = list(dict.fromkeys(key for record in records for key in record))
     columns = {kind: _column(names, kind) for kind in _COLUMNS}
+    columns["identifier"] = _fullest_identifier(records, names)
     for kind in ("right_ascension", "declination", "magnitude"):
         if columns[kind] is None:
             raise MissingDataError(f"no column of {kind.replace('_', ' ')}", where=str(file), value=", ".join(names[:12]),
