@@ -9,10 +9,11 @@ solution is used instead of the equation. Inside a step of length ``h``, where t
 
 and the contribution is the straight line in ``t`` that has the same impulse and the same first moment as this
 exponential over the step, so that rate and attitude at the end of the step are those of the exact lag to the order
-of the integrator, for every ratio ``tau/h`` from zero up. With ``theta = tau/h`` and ``E = exp(-1/theta)`` the two moments
-are ``theta (1 - E)`` and ``theta (theta (1 - E) - E - (1 - E)/2)``: smooth at ``theta = 0``, where their derivatives are
-1 and -1/2, the impulse ``-tau du`` of a switch and its place at the start of the step. They are continued to negative
-``tau`` (a lead, which no actuator has) by using ``|theta|`` inside the brackets, so that zero is an inner point of the fit.
+of the integrator, for every ratio ``tau/h`` from zero up. With ``theta = tau/h`` and ``E = exp(-1/theta)`` the two
+moments are ``theta (1 - E)`` and ``theta (theta (1 - E) - E - (1 - E)/2)``: smooth at ``theta = 0``, where their
+derivatives are 1 and -1/2, the impulse ``-tau du`` of a switch and its place at the start of the step. They are
+continued to negative ``tau`` (a lead, which no actuator has) by using ``|theta|`` inside the brackets, so that zero is
+an inner point of the fit.
 
 The state is ``y`` at the start of the step. Its exact change over the step is given as a derivative that is zero at the
 start and the middle and six times the mean at the end of the step: a classical Runge-Kutta step then holds the state in

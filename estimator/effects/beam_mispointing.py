@@ -44,7 +44,7 @@ def _instances(layout: Layout) -> tuple[EffectInstance, ...]:
 
 EFFECT = register(Effect(
     NAME, "doppler",
-    "One beam (counted from 0 in the file's order) is turned away from its direction in the antenna frame, about the two "
-    "antenna axes most nearly perpendicular to it; a turn about the beam itself has no effect.",
+    "One beam (counted from 0 in the file's order) is turned away from its direction in the antenna frame, about the "
+    "two antenna axes most nearly perpendicular to it; a turn about the beam itself has no effect.",
     _instances, "2 f/c ((R(angles) - 1) beam) . v_antenna on that beam",
 ))

@@ -44,7 +44,7 @@ def _instances(layout: Layout) -> tuple[EffectInstance, ...]:
 
 EFFECT = register(Effect(
     NAME, "star_tracker",
-    "The tracker's stars appear shifted towards the velocity of the spacecraft about the Sun (orbital and annual part), "
+    "The tracker's stars appear shifted towards the velocity of the spacecraft (orbital and annual part), "
     "which turns the measured attitude about the axis perpendicular to boresight and velocity; its size is known, a "
     "scale other than 1 refutes it.",
     _instances, "scale b x v/c, b the tracker's boresight (+z of its axes unless the layout says otherwise)",

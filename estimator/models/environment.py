@@ -1,4 +1,4 @@
-"""The surroundings of a spacecraft along its orbit, as numbers: gravity, magnetic field, Sun, shadow, air, Earth's motion.
+"""The surroundings of a spacecraft along its orbit: gravity, magnetic field, Sun, shadow, air, Earth's motion.
 
 The inertial frame is the campaign's: the Earth turns about its +z by ``angle at epoch + rate t``, and the
 geomagnetic field turns with it. Directions from astropy (barycentric, ICRS axes) are used in the same axes; polar
@@ -11,18 +11,16 @@ astropy and ppigrf are imported when first needed and never reach for the networ
 from __future__ import annotations
 
 import datetime
+import itertools
 import logging
 import warnings
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from estimator.models.earth import EQUATORIAL_RADIUS, FLATTENING, GRAVITATIONAL_PARAMETER, J2
 from estimator.models.errors import NotFiniteError, RequestError, ShapeError
-from estimator.models.gravity_gradient import EARTH_GRAVITATIONAL_PARAMETER
 
-EARTH_RADIUS = 6378137.0  # m, equatorial, WGS 84
-EARTH_FLATTENING = 1 / 298.257223563  # WGS 84
-EARTH_J2 = 1.08262668e-3  # EGM96, unnormalized
 SUN_RADIUS = 6.957e8  # m, IAU 2015 nominal
 REFERENCE_ALTITUDE = 7.0e5  # m
 REFERENCE_DENSITY = 3.6e-14  # kg/m3 at the reference altitude, mean solar activity
@@ -41,9 +39,9 @@ def gravity(position: np.ndarray) -> np.ndarray:
     """
     square = np.sum(position**2, axis=1, keepdims=True)
     z2 = position[:, 2:] ** 2 / square
-    oblate = 1.5 * EARTH_J2 * EARTH_RADIUS**2 / square
+    oblate = 1.5 * J2 * EQUATORIAL_RADIUS**2 / square
     factor = np.concatenate([1 - oblate * (5 * z2 - 1)] * 2 + [1 - oblate * (5 * z2 - 3)], axis=1)
-    return -EARTH_GRAVITATIONAL_PARAMETER / (square * np.sqrt(square)) * position * factor
+    return -GRAVITATIONAL_PARAMETER / (square * np.sqrt(square)) * position * factor
 
 
 def orbit_phase(position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
@@ -61,7 +59,7 @@ def orbit_phase(position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
 def altitude(position: np.ndarray) -> np.ndarray:
     """Height (n,) m above the Earth's ellipsoid along the radius, to first order in the flattening."""
     radius = np.linalg.norm(position, axis=1)
-    return radius - EARTH_RADIUS * (1 - EARTH_FLATTENING * (position[:, 2] / radius) ** 2)
+    return radius - EQUATORIAL_RADIUS * (1 - FLATTENING * (position[:, 2] / radius) ** 2)
 
 
 def density(position: np.ndarray) -> np.ndarray:
@@ -72,7 +70,8 @@ def density(position: np.ndarray) -> np.ndarray:
 def sunlit(position: np.ndarray, sun: np.ndarray, sun_distance: np.ndarray | float = 1.495978707e11) -> np.ndarray:
     """Visible fraction (n,) of the Sun's disc: 1 in sunlight, 0 in the Earth's shadow, smooth in the penumbra.
 
-    The Earth's limb is a straight edge across the disc, which it is to the ratio of the two radii (1/250 in a low orbit).
+    The Earth's limb is taken as a straight edge across the disc, as it is to the ratio of the two radii (1/250 in a
+    low orbit).
 
     Args:
         position: (n, 3) m from the Earth's centre.
@@ -82,7 +81,7 @@ def sunlit(position: np.ndarray, sun: np.ndarray, sun_distance: np.ndarray | flo
     radius = np.linalg.norm(position, axis=1)
     to_earth = -position / radius[:, None]
     separation = 2 * np.arctan2(np.linalg.norm(sun - to_earth, axis=1), np.linalg.norm(sun + to_earth, axis=1))
-    earth = np.arcsin(np.clip(EARTH_RADIUS / radius, 0, 1))
+    earth = np.arcsin(np.clip(EQUATORIAL_RADIUS / radius, 0, 1))
     disc = np.arcsin(SUN_RADIUS / np.asarray(sun_distance))
     u = np.clip((separation - earth) / disc, -1, 1)
     return 0.5 + (u * np.sqrt(1 - u * u) + np.arcsin(u)) / np.pi
@@ -141,7 +140,7 @@ def _stretches(time: np.ndarray) -> list[tuple[int, int]]:
     """Index ranges without a gap longer than the spacing of the field's knots."""
     cuts = np.flatnonzero(np.diff(time) > FIELD_SPACING) + 1
     ends = [0, *cuts.tolist(), len(time)]
-    return list(zip(ends[:-1], ends[1:], strict=True))
+    return list(itertools.pairwise(ends))
 
 
 def _field_along(epoch: str, time: np.ndarray, position: np.ndarray, angle: np.ndarray) -> np.ndarray:
@@ -173,8 +172,8 @@ def _field_along(epoch: str, time: np.ndarray, position: np.ndarray, angle: np.n
     sorted_field = np.full((len(time), 3), np.nan)
     known = evaluate(wanted)
     sorted_field[wanted] = known
-    for a, b, chosen in splines:
-        sorted_field[a:b] = CubicSpline(sorted_time[chosen], sorted_field[chosen])(sorted_time[a:b])
+    for a, b, at_knots in splines:
+        sorted_field[a:b] = CubicSpline(sorted_time[at_knots], sorted_field[at_knots])(sorted_time[a:b])
     if np.max(np.abs(sorted_field[wanted] - known)) > FIELD_TOLERANCE:
         sorted_field = evaluate(np.arange(len(time)))
     field = np.empty_like(sorted_field)

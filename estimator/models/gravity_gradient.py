@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import casadi as ca
 
+from estimator.models.earth import GRAVITATIONAL_PARAMETER
 from estimator.models.rotations import Matrix, rotate
-
-EARTH_GRAVITATIONAL_PARAMETER = 3.986004418e14  # m3/s2, WGS 84
 
 
 def torque(position: Matrix, tracker_from_inertial: Matrix, inertia: Matrix) -> Matrix:
@@ -21,5 +20,5 @@ def torque(position: Matrix, tracker_from_inertial: Matrix, inertia: Matrix) -> 
     """
     r = rotate(tracker_from_inertial, position)
     square = ca.sumsqr(r)
-    factor = 3 * EARTH_GRAVITATIONAL_PARAMETER / (square * square * ca.sqrt(square))
+    factor = 3 * GRAVITATIONAL_PARAMETER / (square * square * ca.sqrt(square))
     return factor * ca.cross(r, ca.mtimes(inertia, r))

@@ -30,5 +30,5 @@ def shift(carrier_frequency: Matrix, beam_direction: Matrix, velocity: Matrix) -
 def exact_shift(carrier_frequency: Matrix, beam_direction: Matrix, velocity: Matrix) -> Any:
     """Exact two-way shift ``2 f beta/(1 - beta)`` (beams, Hz): ``f (1 + beta)/(1 - beta) - f``; arguments as
     :func:`shift`."""
-    beta = ca.mtimes(beam_direction, velocity) / SPEED_OF_LIGHT
+    beta: Matrix = ca.mtimes(beam_direction, velocity) / SPEED_OF_LIGHT
     return 2 * carrier_frequency * beta / (1 - beta)

@@ -1,0 +1,7 @@
+"""Constants of the Earth that the models share."""
+
+GRAVITATIONAL_PARAMETER = 3.986004418e14  # m3/s2, WGS 84
+EQUATORIAL_RADIUS = 6378137.0  # m, WGS 84
+FLATTENING = 1 / 298.257223563  # WGS 84
+J2 = 1.08262668e-3  # EGM96, unnormalized
+ROTATION_RATE = 7.292115e-5  # rad/s, WGS 84
