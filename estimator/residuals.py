@@ -1,0 +1,271 @@
+"""Residuals: a small per-sample CasADi kernel, its data, its noise; whitening and loss are separate.
+
+A :class:`KernelResidual` maps one kernel over many samples. The kernel gives ``r`` (measured minus predicted, in the
+channel's unit) from the unknowns (ambient coordinates), signals, data and noise inputs of ONE sample; the kernel is
+differentiated once and then mapped, and its Jacobian is chained with the signals' outside.
+
+Noise inputs stand for measured quantities that enter the prediction (the attitude of an epoch inside a Doppler
+residual). They are nuisance unknowns, one set per sample, and are eliminated exactly: minimizing over a Gaussian
+noise input of covariance P is the same as whitening with ``R + H P H'``, H being the kernel's Jacobian along it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import casadi as ca
+import numpy as np
+
+from estimator.losses import Loss, Quadratic
+from estimator.models.compiled import Mapped, compiled
+from estimator.signals import Signal, Values
+from estimator.unknowns import Unknown
+
+
+@dataclass(frozen=True, eq=False)
+class Linearization:
+    """A residual and its Jacobian at one point.
+
+    Attributes:
+        residual: (n, m) in the unit of the channel, measured minus predicted.
+        whitened: (n, m), unit variance where the model is right; not weighted by the loss.
+        jacobian: (n, m, p) of the whitened residual along the tangent columns.
+        columns: the unknowns of the p columns, in order.
+        weight: (n,) weight of each sample from the loss and from rejections.
+        cost: sum of the loss over the samples (twice the negative log-likelihood for the quadratic loss).
+        measurements: number of scalar measurements behind it (rows may have been compressed).
+    """
+
+    residual: np.ndarray
+    whitened: np.ndarray
+    jacobian: np.ndarray
+    columns: tuple[Unknown, ...]
+    weight: np.ndarray
+    cost: float
+    measurements: float
+
+
+class Residual(Protocol):
+    """One channel's (or one arc's) part of the joint cost."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def channel(self) -> str: ...
+
+    @property
+    def unit(self) -> str: ...
+
+    @property
+    def unknowns(self) -> tuple[Unknown, ...]: ...
+
+    def linearize(self, values: Values) -> Linearization: ...
+
+    def prepared(self, values: Values) -> Residual:
+        """The same residual with whitening (and compressed robust weights) taken at ``values``."""
+
+    def symbolic(self, values: Mapping[str, ca.MX]) -> ca.MX:
+        """The whitened residual as one CasADi column, with whitening frozen as prepared."""
+
+
+class Kernel:
+    """A per-sample residual function with its Jacobians in tangent coordinates, compiled once.
+
+    Args:
+        name: a C identifier.
+        unknowns: unknowns that enter directly, each an input of its name.
+        signals: (name, manifold) of the signals that enter.
+        data: (name, size) of per-sample data; (name, (rows, columns)) for matrices.
+        noise: (name, size) of noise inputs, all zero at the sample.
+        build: from a dict of input name to SX symbol to the residual (m) as SX.
+    """
+
+    def __init__(self, name: str, unknowns: Sequence[Unknown], signals: Sequence[tuple[str, object]],
+                 data: Sequence[tuple[str, int | tuple[int, int]]], noise: Sequence[tuple[str, int]], build: object):
+        self.unknowns, self.signals, self.noise = tuple(unknowns), tuple(signals), tuple(noise)
+        inputs: dict[str, ca.SX] = {}
+        seen: dict[str, ca.SX] = {}
+        steps: list[tuple[str, ca.SX]] = []
+        for label, manifold in [*((u.name, u.manifold) for u in unknowns), *signals]:  # type: ignore[misc]
+            symbol = ca.SX.sym("x", manifold.ambient)
+            step = ca.SX.sym("d", manifold.tangent)
+            inputs[label] = symbol
+            seen[label] = manifold.retract(symbol, step)
+            steps.append((label, step))
+        for label, size in data:
+            inputs[label] = seen[label] = ca.SX.sym("u", *(size if isinstance(size, tuple) else (size, 1)))
+        zeros = [step for _, step in steps]
+        for label, size in noise:
+            symbol = ca.SX.sym("e", size)
+            seen[label] = symbol
+            steps.append((label, symbol))
+            zeros.append(symbol)
+        residual = ca.densify(ca.SX(build(seen)))  # type: ignore[operator]
+        self.size = residual.shape[0]
+        stacked = ca.vertcat(*zeros)
+        at_zero = ca.substitute([residual, *(ca.jacobian(residual, s) for _, s in steps)], [stacked],
+                                [ca.SX.zeros(stacked.shape)])
+        labels = list(inputs)
+        outputs = [ca.densify(o) for o in at_zero]
+        function = ca.Function(name, [inputs[k] for k in labels], outputs, [f"i{j}" for j in range(len(labels))],
+                               ["residual", *(f"j{j}" for j in range(len(steps)))])
+        self.labels = labels
+        self.steps = [label for label, _ in steps]
+        self.function = compiled(function)
+        shared = tuple(f"i{labels.index(u.name)}" for u in unknowns)
+        self.mapped = Mapped(self.function, shared)
+
+    def __call__(self, samples: int, inputs: Mapping[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Residual (n, m) and the Jacobian (n, m, tangent) along each unknown, signal and noise input."""
+        named = {f"i{j}": inputs[label] for j, label in enumerate(self.labels)}
+        residual, *jacobians = self.mapped(samples, **named)
+        shaped = {}
+        for label, jacobian in zip(self.steps, jacobians, strict=True):
+            shaped[label] = jacobian if jacobian.ndim == 3 else jacobian[:, :, None]
+        return residual, shaped
+
+    def symbolic(self, inputs: Mapping[str, ca.MX]) -> ca.MX:
+        """Residual (m, n) of mapped inputs, for solvers that differentiate by themselves."""
+        return self.function.call([inputs[label] for label in self.labels])[0]
+
+
+@dataclass(frozen=True, eq=False)
+class KernelResidual:
+    """A kernel over ``n`` samples with their data and noise.
+
+    Attributes:
+        name: for reports ("doppler", "star_tracker:free-1").
+        channel: the kind of measurement ("doppler", "star_tracker").
+        unit: of the raw residual.
+        kernel: the compiled kernel.
+        signals: what feeds the kernel's signal inputs.
+        data: per-sample arrays by input name.
+        standard_deviation: (n, m) of the measurement, in ``unit``.
+        noise: (n, size) standard deviation of each noise input.
+        time: (n,) s.
+        arc: (n,) index of the arc of each sample, into ``arc_names``.
+        loss: robust loss.
+        accepted: (n,) False for rejected samples, which keep their place and lose their weight.
+        factor: (n, m, m) inverse Cholesky factor of the covariance, or None before :meth:`prepared`.
+    """
+
+    name: str
+    channel: str
+    unit: str
+    kernel: Kernel
+    signals: tuple[Signal, ...]
+    data: Mapping[str, np.ndarray]
+    standard_deviation: np.ndarray
+    time: np.ndarray
+    arc: np.ndarray
+    arc_names: tuple[str, ...]
+    noise: Mapping[str, np.ndarray] = field(default_factory=dict)
+    loss: Loss = field(default_factory=Quadratic)
+    accepted: np.ndarray | None = None
+    factor: np.ndarray | None = None
+
+    @property
+    def samples(self) -> int:
+        return len(self.time)
+
+    @property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        ordered = dict.fromkeys([*self.kernel.unknowns, *(u for s in self.signals for u in s.unknowns)])
+        return tuple(ordered)
+
+    def _evaluate(self, values: Values) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray]]:
+        inputs: dict[str, np.ndarray] = dict(self.data)
+        inputs.update({u.name: values[u.name] for u in self.kernel.unknowns})
+        signal_jacobians = {}
+        for signal in self.signals:
+            inputs[signal.name], signal_jacobians[signal.name] = signal.evaluate(values)
+        residual, jacobians = self.kernel(self.samples, inputs)
+        return residual, jacobians, signal_jacobians
+
+    def _whitening(self, jacobians: Mapping[str, np.ndarray]) -> np.ndarray:
+        n, m = self.standard_deviation.shape
+        if not self.noise:
+            factor = np.zeros((n, m, m))
+            factor[:, range(m), range(m)] = 1.0 / self.standard_deviation
+            return factor
+        covariance = np.zeros((n, m, m))
+        covariance[:, range(m), range(m)] = self.standard_deviation**2
+        for label, sigma in self.noise.items():
+            spread = jacobians[label] * sigma[:, None, :]
+            covariance += spread @ spread.transpose(0, 2, 1)
+        return np.linalg.inv(np.linalg.cholesky(covariance))
+
+    def prepared(self, values: Values) -> KernelResidual:
+        if not self.noise:
+            return self if self.factor is not None else replace(self, factor=self._whitening({}))
+        return replace(self, factor=self._whitening(self._evaluate(values)[1]))
+
+    def linearize(self, values: Values) -> Linearization:
+        residual, jacobians, signal_jacobians = self._evaluate(values)
+        factor = self.factor if self.factor is not None else self._whitening(jacobians)
+        columns = self.unknowns
+        width = {u.name: u.manifold.tangent for u in columns}
+        starts = dict(zip(width, np.concatenate([[0], np.cumsum(list(width.values()))[:-1]]).astype(int), strict=True))
+        jacobian = np.zeros((self.samples, self.kernel.size, sum(width.values())))
+        for unknown in self.kernel.unknowns:
+            a = starts[unknown.name]
+            jacobian[:, :, a : a + width[unknown.name]] += factor @ jacobians[unknown.name]
+        for signal in self.signals:
+            chained = (factor @ jacobians[signal.name]) @ signal_jacobians[signal.name]
+            position = 0
+            for unknown in signal.unknowns:
+                a, w = starts[unknown.name], width[unknown.name]
+                jacobian[:, :, a : a + w] += chained[:, :, position : position + w]
+                position += w
+        whitened = np.einsum("nij,nj->ni", factor, residual)
+        square = np.einsum("ni,ni->n", whitened, whitened)
+        keep = np.ones(self.samples) if self.accepted is None else self.accepted.astype(float)
+        return Linearization(
+            residual=residual,
+            whitened=whitened,
+            jacobian=jacobian,
+            columns=columns,
+            weight=self.loss.weight(square) * keep,
+            cost=float(np.sum(self.loss.value(square) * keep)),
+            measurements=float(keep.sum() * self.kernel.size),
+        )
+
+    def symbolic(self, values: Mapping[str, ca.MX]) -> ca.MX:
+        n, m = self.samples, self.kernel.size
+        inputs: dict[str, ca.MX] = {}
+        for label in self.kernel.labels:
+            if label in self.data:
+                array = np.asarray(self.data[label], dtype=float)
+                flat = array.reshape(n, -1) if array.ndim < 3 else None
+                stacked = flat.T if flat is not None else np.concatenate(list(array), axis=1)
+                inputs[label] = ca.MX(ca.DM(stacked))
+        for unknown in self.kernel.unknowns:
+            inputs[unknown.name] = ca.repmat(values[unknown.name], 1, n)
+        for signal in self.signals:
+            inputs[signal.name] = signal.symbolic(values)
+        raw = self.kernel.function.map(n).call([inputs[label] for label in self.kernel.labels])[0]
+        if self.factor is None:
+            raise ValueError("prepare the residual before asking for its symbolic form")
+        rows = [ca.sum1(ca.DM(self.factor[:, i, :].T) * raw) for i in range(m)]
+        return ca.vec(ca.vertcat(*rows))
+
+    def subset(self, keep: np.ndarray) -> KernelResidual:
+        """The residual of the samples of the boolean mask ``keep`` (n,)."""
+        return replace(
+            self,
+            signals=tuple(s.subset(keep) for s in self.signals),
+            data={k: np.asarray(v)[keep] for k, v in self.data.items()},
+            standard_deviation=self.standard_deviation[keep],
+            noise={k: v[keep] for k, v in self.noise.items()},
+            time=self.time[keep],
+            arc=self.arc[keep],
+            accepted=None if self.accepted is None else self.accepted[keep],
+            factor=None if self.factor is None else self.factor[keep],
+        )
+
+    def with_data(self, **data: np.ndarray) -> KernelResidual:
+        """The residual with some of its data replaced (a simulation draws new measurements)."""
+        return replace(self, data={**self.data, **data})

@@ -1,0 +1,95 @@
+"""From a converged point to an :class:`~estimator.estimate.Estimate`: covariance, consistency, status, sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from estimator.consistency import consistency
+from estimator.estimate import Estimate, ResidualSummary, Status
+from estimator.observability import weak_directions
+from estimator.problem import Problem, normal_equations
+from estimator.residuals import Linearization
+from estimator.unknowns import offsets
+
+GAP_LEVEL = 1 - 6.3e-5
+"""Two-sided level of the chi-square test of each residual (4 standard deviations)."""
+
+
+def summarized(problem: Problem, values: Mapping[str, np.ndarray], parts: Sequence[Linearization], *, converged: bool,
+               reason: str, iterations: int, solver: str, seconds: float) -> Estimate:
+    """The estimate at ``values``, with everything that a user needs to trust it or not.
+
+    Args:
+        problem: what was solved, prepared at ``values``.
+        values: the solution.
+        parts: the linearizations at ``values``.
+        converged: whether the solver met its tolerance.
+        reason: the sentence when it did not.
+        iterations, solver, seconds: for the record.
+    """
+    free = problem.free
+    equations = normal_equations(problem, values, parts)
+    scales = np.concatenate([np.zeros(0), *(u.scales for u in free)])
+    weak = weak_directions(equations.matrix, free) if len(scales) else []
+    covariance = _pseudo_inverse(equations.matrix, len(weak)) * np.outer(scales, scales)
+    summaries = tuple(
+        _summary(residual, part, covariance, problem) for residual, part in zip(problem.residuals, parts, strict=True)
+    )
+    gaps = [s for s in summaries if s.consistency.verdict == "too large"]
+    status, sentences = Status.OK, []
+    if not converged:
+        status = Status.NOT_CONVERGED
+        sentences.append(reason)
+    if gaps:
+        status = max(status, Status.MODEL_GAP, key=lambda s: s.gravity)
+        worst = sorted(gaps, key=lambda s: -s.consistency.ratio)
+        named = ", ".join(f"{s.name} (chi2 per degree of freedom {s.consistency.ratio:.4g})" for s in worst[:6])
+        sentences.append(f"the model does not explain the data in {named}")
+    asked = [w for w in weak if any(not _by_name(problem, n).nuisance for n in w.participation)]
+    if asked:
+        status = max(status, Status.UNOBSERVABLE, key=lambda s: s.gravity)
+        sentences.append("the data do not determine " + "; ".join(w.sentence for w in asked))
+    if not sentences:
+        sentences.append(f"converged in {iterations} iterations; every residual agrees with its declared noise")
+    return Estimate(problem, dict(values), covariance, tuple(weak), parts, summaries, status, ". ".join(sentences),
+                    iterations, solver, seconds)
+
+
+def _by_name(problem: Problem, name: str):  # type: ignore[no-untyped-def]
+    return problem.unknown(name)
+
+
+def _pseudo_inverse(matrix: np.ndarray, dropped: int) -> np.ndarray:
+    if dropped == 0 and len(matrix):
+        factor = np.linalg.inv(np.linalg.cholesky(matrix))
+        return factor.T @ factor
+    eigenvalues, vectors = np.linalg.eigh(matrix)
+    kept = vectors[:, dropped:]
+    return (kept / eigenvalues[dropped:]) @ kept.T
+
+
+def _summary(residual, part: Linearization, covariance: np.ndarray, problem: Problem) -> ResidualSummary:  # type: ignore[no-untyped-def]
+    columns = offsets(problem.free)
+    picks, places, position = [], [], 0
+    for u in part.columns:
+        width = u.manifold.tangent
+        if u.name in columns:
+            picks.append(np.arange(position, position + width))
+            places.append(np.arange(columns[u.name].start, columns[u.name].stop))
+        position += width
+    used = 0.0
+    if picks:
+        pick, place = np.concatenate(picks), np.concatenate(places)
+        rows = part.jacobian[:, :, pick] * np.sqrt(part.weight)[:, None, None]
+        flat = rows.reshape(-1, len(pick))
+        used = float(np.sum((flat.T @ flat) * covariance[np.ix_(place, place)]))
+    total = float(np.sum(part.weight[:, None] * part.whitened**2))
+    kept = part.weight > 0
+    raw = part.residual
+    mask = kept if len(kept) == len(raw) else np.ones(len(raw), dtype=bool)
+    rms = float(np.sqrt(np.mean(raw[mask] ** 2))) if mask.any() else float("nan")
+    rejected = int(len(raw) - mask.sum()) + int(getattr(residual, "rejected", 0))
+    return ResidualSummary(residual.name, residual.channel, residual.unit, rms,
+                           consistency(total, part.measurements - used, GAP_LEVEL), rejected)

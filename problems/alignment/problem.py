@@ -1,0 +1,430 @@
+"""Which question: how do antenna, star tracker and actuators sit against each other, and how is mass distributed?
+
+``alignment_problem(campaign)`` makes the ONE joint nonlinear least-squares problem of a campaign: the relative
+quaternion ``antenna_from_tracker``, the ``normalized_inertia``, the quaternion ``actuator_from_tracker`` with the
+``inertia_trace``, the Fourier coefficients of the ``trajectory``, and per rotation arc the attitude and rate at its
+start. Residuals: GNSS positions (compressed exactly), Doppler per beam with the tracker's noise in its covariance, and
+the star tracker along every rotation arc. What a campaign cannot determine is left out of the problem and named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from estimator.effects.declaration import ENVIRONMENT, EffectInstance, Layout
+from estimator.linear_block import compress
+from estimator.losses import Loss, Quadratic
+from estimator.models.errors import RequestError, TooFewDataError
+from estimator.models.fourier_trajectory import FourierFrame
+from estimator.models.inertia import entries_of
+from estimator.problem import Problem
+from estimator.propagation import PropagatedSignal
+from estimator.residuals import KernelResidual, Residual
+from estimator.trajectory_residual import TrajectoryResidual, felt_directions, trajectory_unknown
+from estimator.unknowns import UnitQuaternion, Unknown, Vector
+from problems.alignment.attitude_at_epochs import AttitudeAtEpochs, attitude_at_epochs
+from problems.alignment.campaign import Arc, Campaign
+from problems.alignment.kernels import (
+    ACTUATOR,
+    ANTENNA,
+    INERTIA,
+    attitude_kernel,
+    doppler_kernel,
+    effect_unknown,
+    inertia_trace_unknown,
+    position_effect_kernel,
+    rotation_flow,
+)
+from problems.alignment.starting_point import StartingPoint, starting_point
+
+LONGEST_STEP = 0.5  # s between nodes of a rotation arc
+ROTATION_PER_STEP = 0.02  # rad between nodes: the fourth-order step is then exact to 1e-11 rad over an arc
+FEWEST_ARC_SAMPLES = 4  # star tracker samples that make a rotation arc worth its six unknowns
+
+
+@dataclass(frozen=True, eq=False)
+class AlignmentModel:
+    """A campaign with everything about it that does not depend on the effects in the model, computed once.
+
+    Attributes:
+        campaign: the flight data.
+        loss: robust loss of every sample.
+        degree: degree of the Fourier trajectory; None chooses it from the data.
+    """
+
+    campaign: Campaign
+    loss: Loss
+    degree: int | None = None
+
+    @cached_property
+    def frame(self) -> FourierFrame:
+        """The Fourier frame of the trajectory."""
+        gnss = self.campaign.gnss
+        if self.degree is not None:
+            return FourierFrame(float(gnss.time[0]), float(gnss.time[-1]), self.degree)
+        return choose_degree(gnss.time, gnss.position, gnss.standard_deviation).frame
+
+    @cached_property
+    def position_weights(self) -> np.ndarray:
+        """Inverse variance of each position (n, 3), times the robust weight."""
+        gnss = self.campaign.gnss
+        weights = np.broadcast_to(1.0 / gnss.standard_deviation**2, gnss.position.shape).copy()
+        if isinstance(self.loss, Quadratic):
+            return weights
+        robust = np.ones(len(gnss.time))
+        for _ in range(12):
+            block = compress(self.frame, gnss.time, gnss.position, weights * robust[:, None])
+            renewed = self.loss.weight(np.sum(block.residuals() ** 2 * weights, axis=1))
+            change = float(np.max(np.abs(renewed - robust)))
+            robust = renewed
+            if change < 1e-3:
+                break
+        return weights * robust[:, None]
+
+    @cached_property
+    def block(self):  # type: ignore[no-untyped-def]
+        """The compressed positions (:class:`estimator.linear_block.LinearBlock`)."""
+        gnss = self.campaign.gnss
+        return compress(self.frame, gnss.time, gnss.position, self.position_weights)
+
+    def earth_angle(self, time: np.ndarray) -> np.ndarray:
+        """Angle of the Earth-fixed frame about +z from inertial (n,), rad."""
+        return self.campaign.earth_rotation_angle_at_epoch + self.campaign.earth_rotation_rate * np.asarray(time)
+
+    def velocity(self, time: np.ndarray) -> np.ndarray:
+        """Fitted Earth-fixed velocity (n, 3), m/s, at times inside the positions' span (clamped outside)."""
+        return self.block.values(self._inside(time), 1)
+
+    def position(self, time: np.ndarray) -> np.ndarray:
+        """Fitted Earth-fixed position (n, 3), m."""
+        return self.block.values(self._inside(time), 0)
+
+    def _inside(self, time: np.ndarray) -> np.ndarray:
+        return np.clip(np.asarray(time, dtype=float), self.frame.start, self.frame.stop)
+
+    @cached_property
+    def rotation_arcs(self) -> tuple[tuple[Arc, np.ndarray], ...]:
+        """Rotation arcs with the indices of their star tracker samples, those with too few left out."""
+        time = self.campaign.star_tracker.time
+        found = []
+        for kind in ("free_rotation", "torque_pulse"):
+            for arc in self.campaign.arcs_of_kind(kind):  # type: ignore[arg-type]
+                index = np.flatnonzero((time >= arc.start - 1e-9) & (time <= arc.stop + 1e-9))
+                if len(index) >= FEWEST_ARC_SAMPLES:
+                    found.append((arc, index))
+        return tuple(found)
+
+    @cached_property
+    def skipped_arcs(self) -> tuple[str, ...]:
+        """Names of rotation arcs with too few star tracker samples."""
+        used = {a.name for a, _ in self.rotation_arcs}
+        return tuple(a.name for a in self.campaign.arcs if a.kind != "doppler" and a.name not in used)
+
+    @cached_property
+    def doppler_epochs(self) -> np.ndarray:
+        """Indices of the Doppler epochs inside both the tracker's and the positions' data."""
+        doppler = self.campaign.doppler
+        if doppler is None:
+            return np.zeros(0, dtype=int)
+        covered = self._attitude_at_doppler.covered
+        inside = (doppler.time >= self.frame.start - 1e-6) & (doppler.time <= self.frame.stop + 1e-6)
+        return np.flatnonzero(covered & inside)
+
+    @cached_property
+    def _attitude_at_doppler(self) -> AttitudeAtEpochs:
+        assert self.campaign.doppler is not None
+        return attitude_at_epochs(self.campaign.star_tracker, self.campaign.doppler.time)
+
+    @cached_property
+    def start(self) -> StartingPoint:
+        """The starting point from the cheap closed forms."""
+        return starting_point(self.campaign, self.velocity, self.position)
+
+    @cached_property
+    def session_of_epoch(self) -> tuple[np.ndarray, tuple[str, ...]]:
+        """Index of the Doppler arc of each used epoch, and the arcs' names; stretches without an arc get their own."""
+        assert self.campaign.doppler is not None
+        time = self.campaign.doppler.time[self.doppler_epochs]
+        arcs = self.campaign.arcs_of_kind("doppler")
+        label = np.full(len(time), -1)
+        for i, arc in enumerate(arcs):
+            label[(time >= arc.start - 1e-6) & (time <= arc.stop + 1e-6)] = i
+        names = [a.name for a in arcs]
+        if (label < 0).any():
+            label[label < 0] = len(names)
+            names.append("outside the arcs")
+        return label, tuple(names)
+
+    @cached_property
+    def layout(self) -> Layout:
+        """What effects may need to know about the campaign."""
+        campaign = self.campaign
+        radius = float(np.median(np.linalg.norm(campaign.gnss.position, axis=1)))
+        period = 2 * np.pi * np.sqrt(radius**3 / 3.986004418e14)  # s; m3/s2 of the Earth
+        doppler = campaign.doppler
+        beams = 0 if doppler is None else doppler.frequency_shift.shape[1]
+        directions: tuple[tuple[float, float, float], ...] = ()
+        if doppler is not None:
+            mean = doppler.beam_direction if doppler.beam_direction.ndim == 2 else doppler.beam_direction.mean(axis=0)
+            unit = mean / np.linalg.norm(mean, axis=1, keepdims=True)
+            directions = tuple((float(d[0]), float(d[1]), float(d[2])) for d in unit)
+        time = campaign.star_tracker.time
+        return Layout(beams, tuple((a.start, a.stop) for a in campaign.arcs_of_kind("doppler")),
+                      (float(min(campaign.gnss.time[0], time[0])), float(max(campaign.gnss.time[-1], time[-1]))),
+                      period, (float(time[0]), float(time[-1])), directions)
+
+    def environment(self, time: np.ndarray) -> np.ndarray:
+        """Table (n, rows) of everything about the environment that an effect may depend on, along the orbit."""
+        from scipy.spatial.transform import Rotation
+
+        from estimator.models.environment import environment_table
+
+        time = np.asarray(time, dtype=float)
+        angle = self.earth_angle(time)
+        inertial_from_fixed = Rotation.from_rotvec(np.column_stack([0 * angle, 0 * angle, angle]))
+        fixed = self.position(time)
+        spin = np.array([0.0, 0.0, self.campaign.earth_rotation_rate])
+        position = inertial_from_fixed.apply(fixed)
+        velocity = inertial_from_fixed.apply(self.velocity(time) + np.cross(spin, fixed))
+        table = environment_table(self.campaign.epoch, time, position, velocity,
+                                  self.campaign.earth_rotation_angle_at_epoch, self.campaign.earth_rotation_rate)
+        return np.column_stack([np.asarray(table[name]).reshape(len(time), size)
+                                for name, size in ENVIRONMENT.items()])
+
+    def effect_instances(self, names: Iterable[str]) -> tuple[EffectInstance, ...]:
+        """The instances of the effects asked for by name; a family name gives all of its instances.
+
+        Raises:
+            RequestError: no effect of that name exists on this campaign.
+        """
+        names = tuple(names)
+        if not names:
+            return ()
+        from estimator.effects.library import load
+
+        registered = load()
+        found: list[EffectInstance] = []
+        for name in names:
+            family = registered.get(name.split(":")[0])
+            if family is None:
+                raise RequestError(f"no effect is named {name!r}", where="effects",
+                                   remedy="choose from " + ", ".join(registered))
+            present = family.instances(self.layout)
+            chosen = [e for e in present if name in (e.name, e.family)]
+            if not chosen:
+                raise RequestError(f"the effect {name!r} does not exist on this campaign", where="effects",
+                                   remedy="choose from " + (", ".join(e.name for e in present) or "other effects"))
+            found += [e for e in chosen if e not in found]
+        return tuple(found)
+
+
+def alignment_model(campaign: Campaign, *, loss: Loss | None = None, degree: int | None = None) -> AlignmentModel:
+    """Prepare a campaign for the joint problem.
+
+    Args:
+        campaign: checked flight data.
+        loss: robust loss of every sample; default quadratic.
+        degree: degree of the Fourier trajectory; None chooses it from the data.
+
+    Raises:
+        TooFewDataError: fewer than four positions.
+    """
+    if len(campaign.gnss.time) < 4:
+        raise TooFewDataError("too few positions for a trajectory", where="gnss/position",
+                              value=len(campaign.gnss.time), limit="at least 4")
+    return AlignmentModel(campaign, loss or Quadratic(), degree)
+
+
+def alignment_problem(model: AlignmentModel, effects: Sequence[str] = (), *,
+                      candidates: Sequence[str] = ()) -> Problem:
+    """The joint problem of a prepared campaign.
+
+    Args:
+        model: the prepared campaign.
+        effects: names of effects whose parameters are estimated with everything else.
+        candidates: names of effects that are in the kernels and held at zero, for score tests.
+
+    Raises:
+        RequestError: an unknown effect.
+    """
+    active = model.effect_instances(effects)
+    dormant = tuple(e for e in model.effect_instances(candidates) if e not in active)
+    everything = (*active, *dormant)
+    unknowns: dict[str, Unknown] = {}
+    residuals: list[Residual] = []
+    start: dict[str, np.ndarray] = {}
+    starting = model.start
+
+    def need(unknown: Unknown, value: np.ndarray) -> None:
+        unknowns.setdefault(unknown.name, unknown)
+        start.setdefault(unknown.name, np.asarray(value, dtype=float))
+
+    positions = _positions(model, everything)
+    has_doppler = len(model.doppler_epochs) > 0
+    if has_doppler:
+        need(ANTENNA, starting.antenna_from_tracker)
+    if model.rotation_arcs:
+        need(INERTIA, _entries(starting.normalized_inertia))
+    doppler = _doppler(model, everything, positions) if has_doppler else None
+    rotations = [_rotation(model, arc, index, everything) for arc, index in model.rotation_arcs]
+    for residual, _ in rotations:
+        for unknown in residual.unknowns:
+            if unknown.name == "inertia_trace":
+                need(unknown, np.array([starting.inertia_trace]))
+            elif unknown.name == ACTUATOR.name:
+                need(ACTUATOR, starting.actuator_from_tracker)
+    for e in everything:
+        if any(u.name == e.name for r in [positions, doppler, *(r for r, _ in rotations)] if r for u in r.unknowns):
+            need(effect_unknown(e), _effect_start(e))
+    for residual, arc in rotations:
+        attitude, rate = starting.arc_states[arc.name]
+        for unknown, value in zip(_arc_unknowns(arc), (attitude, rate), strict=True):
+            need(unknown, value)
+        residuals.append(residual)
+    need(positions.trajectory, np.zeros(positions.trajectory.manifold.tangent))
+    ordered = [positions, *([doppler] if doppler else []), *residuals]
+    held = {e.name for e in dormant if e.name in unknowns}
+    commanded = any(u.name == ACTUATOR.name for u in unknowns.values())
+    if "inertia_trace" in unknowns and not commanded:
+        held.add("inertia_trace")  # without a commanded torque nothing has the unit of a torque
+    return Problem(
+        unknowns=tuple(unknowns.values()), residuals=tuple(ordered), start=start, held=frozenset(held),
+        rebuild=lambda names: alignment_problem(model, names, candidates=candidates),
+        effects=tuple(e.name for e in active),
+    )
+
+
+def _entries(normalized: np.ndarray) -> np.ndarray:
+    return entries_of(normalized / np.trace(normalized))
+
+
+def _effect_start(effect: EffectInstance) -> np.ndarray:
+    """Zero, or the middle of the range where the parameter is searched."""
+    values = []
+    for p in effect.parameters:
+        if p.search is None:
+            values.append(0.0)
+        elif p.search[3] == "logarithmic":
+            values.append(float(np.sqrt(p.search[0] * p.search[1])))
+        else:
+            values.append(0.5 * (p.search[0] + p.search[1]))
+    return np.array(values)
+
+
+def _arc_unknowns(arc: Arc) -> tuple[Unknown, Unknown]:
+    return (
+        Unknown(f"attitude:{arc.name}", UnitQuaternion(), "rad", 0.1, nuisance=True, frame="tracker",
+                description=f"attitude at the start of {arc.name}"),
+        Unknown(f"rate:{arc.name}", Vector(3, ("x", "y", "z")), "rad/s", 0.01, nuisance=True,
+                description=f"angular rate at the start of {arc.name}, tracker axes"),
+    )
+
+
+def _positions(model: AlignmentModel, effects: tuple[EffectInstance, ...]) -> TrajectoryResidual:
+    gnss = model.campaign.gnss
+    epochs = []
+    if len(model.doppler_epochs):
+        assert model.campaign.doppler is not None
+        epochs.append((model._inside(model.campaign.doppler.time[model.doppler_epochs]), 1))
+    directions = felt_directions(model.block, epochs)
+    kernel, data = None, {}
+    if any(e.channel == "gnss" for e in effects):
+        kernel = position_effect_kernel(tuple(e for e in effects if e.channel == "gnss"))
+        tracker = model.campaign.star_tracker
+        try:
+            attitude = attitude_at_epochs(tracker, gnss.time)
+            quaternion, rate, inside = attitude.quaternion, attitude.rate, attitude.covered.astype(float)
+        except ValueError:
+            quaternion = np.tile([1.0, 0.0, 0.0, 0.0], (len(gnss.time), 1))
+            rate, inside = np.zeros((len(gnss.time), 3)), np.zeros(len(gnss.time))
+        arcs = np.zeros(len(gnss.time), dtype=bool)
+        for arc in model.campaign.arcs:
+            arcs |= (gnss.time >= arc.start - 1e-6) & (gnss.time <= arc.stop + 1e-6)
+        data = {"environment": model.environment(gnss.time), "attitude": quaternion, "rate": rate,
+                "inside_arc": inside * arcs}
+    return TrajectoryResidual("gnss", "gnss", "m", trajectory_unknown(directions), model.block, directions, gnss.time,
+                              gnss.position, model.position_weights, kernel, data)
+
+
+def _doppler(model: AlignmentModel, effects: tuple[EffectInstance, ...],
+             positions: TrajectoryResidual) -> KernelResidual:
+    doppler = model.campaign.doppler
+    assert doppler is not None
+    index = model.doppler_epochs
+    time = doppler.time[index]
+    beams = doppler.frequency_shift.shape[1]
+    kernel = doppler_kernel(beams, tuple(e for e in effects if e.channel in ("star_tracker", "doppler")))
+    attitude = model._attitude_at_doppler
+    directions = doppler.beam_direction
+    per_epoch = directions[index] if directions.ndim == 3 else np.broadcast_to(directions, (len(index), beams, 3))
+    data = {
+        "attitude": attitude.quaternion[index],
+        "earth_angle": model.earth_angle(time)[:, None],
+        "beam_direction": per_epoch,
+        "shift": doppler.frequency_shift[index],
+        "carrier": np.full((len(index), 1), doppler.carrier_frequency),
+    }
+    if "environment" in kernel.labels:
+        data["environment"] = model.environment(time)
+        data["rate"] = attitude.rate[index]
+    arc, names = model.session_of_epoch
+    sigma = np.broadcast_to(doppler.standard_deviation, doppler.frequency_shift.shape)[index]
+    return KernelResidual(
+        "doppler", "doppler", "Hz", kernel, (positions.signal("velocity", model._inside(time), 1),), data, sigma,
+        time, arc, names, noise={"attitude_error": attitude.standard_deviation[index]}, loss=model.loss,
+    )
+
+
+def _rotation(model: AlignmentModel, arc: Arc, index: np.ndarray,
+              effects: tuple[EffectInstance, ...]) -> tuple[KernelResidual, Arc]:
+    tracker, torque = model.campaign.star_tracker, model.campaign.torque
+    time = tracker.time[index]
+    _, rate = model.start.arc_states[arc.name]
+    longest = min(LONGEST_STEP, ROTATION_PER_STEP / max(float(np.linalg.norm(rate)), 1e-9))
+    switches = np.zeros(0)
+    if torque is not None:
+        both = np.concatenate([torque.start, torque.stop])
+        switches = both[(both > arc.start) & (both < time[-1])]
+    nodes, sample_nodes = _nodes(min(arc.start, float(time[0])), time, switches, longest)
+    middle = 0.5 * (nodes[:-1] + nodes[1:])
+    command = np.zeros((len(middle), 3))
+    if torque is not None:
+        for start, stop, value in zip(torque.start, torque.stop, torque.command, strict=True):
+            command[(middle > start) & (middle < stop)] += value
+    commanded = bool(np.any(command))
+    moving = tuple(e for e in effects if e.channel in (("torque", "command") if commanded else ("torque",)))
+    trace = float(np.trace(model.campaign.nominal.inertia))
+    flow = rotation_flow(commanded, moving, trace, 1)
+    inputs = model.environment(nodes) if moving else np.zeros((len(nodes), 0))
+    signal = PropagatedSignal("state", flow, _arc_unknowns(arc), nodes, inputs,
+                              command if commanded else np.zeros((len(middle), 0)), sample_nodes)
+    kernel = attitude_kernel(moving, tuple(e for e in effects if e.channel == "star_tracker"))
+    data = {"measured": tracker.quaternion[index]}
+    if "environment" in kernel.labels:
+        data["environment"] = model.environment(time)
+    sigma = np.broadcast_to(tracker.standard_deviation, (len(tracker.time), 3))[index]
+    residual = KernelResidual(f"star_tracker:{arc.name}", "star_tracker", "rad", kernel, (signal,), data, sigma, time,
+                              np.zeros(len(time), dtype=int), (arc.name,), loss=model.loss)
+    return residual, arc
+
+
+def _nodes(start: float, samples: np.ndarray, switches: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
+    """Integration nodes: the start, every sample, every switch of the torque, and no step longer than ``longest``."""
+    required = np.unique(np.concatenate([[start], samples, switches]))
+    merged = [required[0]]
+    for t in required[1:]:
+        if t - merged[-1] > 1e-9:
+            merged.append(t)
+    required = np.array(merged)
+    pieces = [required[:1]]
+    for a, b in zip(required[:-1], required[1:], strict=True):
+        steps = int(np.ceil((b - a) / longest - 1e-9))
+        pieces.append(a + (b - a) * np.arange(1, steps + 1) / steps)
+    nodes = np.concatenate(pieces)
+    index = np.searchsorted(nodes, samples - 1e-9)
+    return nodes, np.minimum(index, len(nodes) - 1)
+
