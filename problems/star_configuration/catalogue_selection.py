@@ -349,7 +349,7 @@ def _greedy(problem: _Problem) -> np.ndarray:
 
 
 def _relaxation(problem: _Problem, target: float) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-    """Solve the fractional problem by a barrier method and return the best bound on the way.
+    """Solve the fractional problem by an interior-point method and return the best bound on the way.
 
     Args:
         target: the search ends early when the bound reaches this value.
@@ -375,8 +375,8 @@ def _relaxation(problem: _Problem, target: float) -> tuple[float, np.ndarray, np
     x = np.clip(x, 1e-9, 1 - 1e-9)
     best_bound, best_choice, best_scores, best_x = -np.inf, np.zeros(0, dtype=int), np.zeros(n), x
     weight = _matrix(problem.weight)
-    barrier = None
-    for _ in range(60):
+    low = high = cap = np.zeros(0)  # multipliers of x >= 0, x <= 1 and of the quotas
+    for iteration in range(40):
         total = problem.base + x @ m
         inverse = np.linalg.inv(_matrix(total))
         middle = inverse @ weight @ inverse
@@ -387,38 +387,45 @@ def _relaxation(problem: _Problem, target: float) -> tuple[float, np.ndarray, np
         bound = 2 * value - float(gradient6 @ problem.base) - float(scores[chosen].sum())
         if bound > best_bound:
             best_bound, best_choice, best_scores, best_x = bound, chosen, scores, x
-        if best_bound >= target * (1 - _SAME) or value - best_bound <= 1e-9 * value:
+        # No bound can rise above the value: stop when the rest cannot matter against what is missing to the target.
+        if best_bound >= target * (1 - _SAME) or value - best_bound <= max(0.02 * (target - best_bound), 1e-9 * value):
             break
-        gap = value - bound
-        barrier = gap / (2 * n) if barrier is None else min(0.3 * barrier, gap / (4 * n))
-        # Newton step of value(x) - barrier * sum(log x + log(1 - x) + log(cap - row x)), sum x = count.
         slack = caps - capped @ x
-        gradient = -scores - barrier * (1 / x - 1 / (1 - x))
-        diagonal = barrier * (1 / x**2 + 1 / (1 - x) ** 2)
-        if len(caps):
-            gradient = gradient + capped.T @ (barrier / slack)
-        # Second derivative along M_i, M_j: 2 trace(F^-1 M_i F^-1 A F^-1 M_j), a 6 x 6 form in the entries.
+        if iteration == 0:
+            barrier = (value - bound) / (2 * n)
+            low, high, cap = barrier / x, barrier / (1 - x), barrier / slack
+        barrier = 0.15 * float(low @ x + high @ (1 - x) + cap @ slack) / (2 * n + len(caps))
+        # Primal-dual Newton step: the matrix is diagonal plus rank six (plus one for each quota).
+        gradient = -scores - barrier / x + barrier / (1 - x) + capped.T @ (barrier / slack)
+        diagonal = low / x + high / (1 - x)
         curvature = _curvature(inverse, middle)
-        root = np.linalg.cholesky(curvature + 1e-14 * np.trace(curvature) * np.eye(6))
-        low_rank = m @ root
-        if len(caps):
-            low_rank = np.hstack((low_rank, capped.T * (np.sqrt(barrier) / slack)))
+        root = np.linalg.cholesky(curvature + 1e-13 * np.trace(curvature) * np.eye(6))
+        low_rank = np.hstack((m @ root, capped.T * np.sqrt(cap / slack)))
         scaled = low_rank / diagonal[:, None]
         inner = np.eye(low_rank.shape[1]) + low_rank.T @ scaled
-        right = np.column_stack((-gradient, equal.T))
-        solved = right / diagonal[:, None]
+        solved = np.column_stack((-gradient, equal.T)) / diagonal[:, None]
         solved -= scaled @ np.linalg.solve(inner, low_rank.T @ solved)
         multiplier = np.linalg.solve(equal @ solved[:, 1:], equal @ solved[:, 0])
         step = solved[:, 0] - solved[:, 1:] @ multiplier
-        with np.errstate(divide="ignore", invalid="ignore"):
-            limits = np.where(step < 0, -x / step, np.where(step > 0, (1 - x) / step, np.inf))
-            longest = float(np.min(limits))
-            if len(caps):
-                pace = capped @ step
-                longest = min(longest, float(np.min(np.where(pace > 0, slack / pace, np.inf))))
-        x = x + min(1.0, 0.95 * longest) * step
-        x = np.clip(x, 1e-14, 1 - 1e-14)
+        step_low = barrier / x - low - low / x * step
+        step_high = barrier / (1 - x) - high + high / (1 - x) * step
+        pace = capped @ step
+        step_cap = barrier / slack - cap + cap / slack * pace
+        primal = min(_longest(x, step), _longest(1 - x, -step), _longest(slack, -pace))
+        dual = min(_longest(low, step_low), _longest(high, step_high), _longest(cap, step_cap))
+        x = x + primal * step
+        low, high, cap = low + dual * step_low, high + dual * step_high, cap + dual * step_cap
+        if float(min(x.min(), 1 - x.max())) < 1e-14:
+            break
     return best_bound, best_choice, best_scores, best_x
+
+
+def _longest(value: np.ndarray, step: np.ndarray) -> float:
+    """The longest step up to 1 that keeps ``value`` positive, with a margin."""
+    falling = step < 0
+    if not np.any(falling):
+        return 1.0
+    return min(1.0, 0.95 * float(np.min(-value[falling] / step[falling])))
 
 
 _BASIS = np.zeros((6, 3, 3))
@@ -428,7 +435,7 @@ for _k, (_i, _j) in enumerate(_SYMMETRIC):
 
 def _curvature(inverse: np.ndarray, middle: np.ndarray) -> np.ndarray:
     """Second derivative (6 x 6) of ``trace(A F^-1)`` in the six entries of F, from F^-1 and F^-1 A F^-1."""
-    left = (inverse @ _BASIS).reshape(6, 9)
+    left = (_BASIS @ inverse).reshape(6, 9)
     right = (_BASIS @ middle).transpose(0, 2, 1).reshape(6, 9)
     half = left @ right.T
     return half + half.T
