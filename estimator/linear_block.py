@@ -41,19 +41,15 @@ _NEGLIGIBLE = 0.1  # standard deviations
 
 
 @dataclass(frozen=True)
-class _Factor:
-    """The factorised problem of axes that share their weights up to a constant.
+class _Solution:
+    """The factorised least-squares problem of merged cells in the orthonormal functions of a frame.
 
-    ``householder`` and ``tau`` hold the orthogonal part Q of the QR factorisation of the design in the orthonormal
-    functions; ``right`` maps zeta to amounts of them; where a decomposition in singular values was needed, ``left``
-    takes the first rows of Q^T z to zeta.
+    ``householder`` and ``tau`` hold the orthogonal part Q of the QR factorisation of the design; ``right`` maps zeta to
+    amounts of the functions; where a decomposition in singular values was needed, ``left`` takes the first rows of
+    Q^T z to zeta.
     """
 
     directions: Directions
-    cells: tuple[Cells, ...]
-    layout: Layout
-    weight: np.ndarray
-    order: np.ndarray | None
     householder: np.ndarray
     tau: np.ndarray
     right: np.ndarray
@@ -65,25 +61,33 @@ class _Factor:
 
     def coordinates(self, vectors: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """zeta (rank, q) of right-hand sides of the merged cells, and the sum of squares (q,) left over."""
-        stacked = np.concatenate(vectors)
-        turned = _apply(self.householder, self.tau, stacked)
-        columns = self.householder.shape[1] if self.householder.shape[0] > self.householder.shape[1] else None
-        top, bottom = (turned, turned[:0]) if columns is None else (turned[:columns], turned[columns:])
-        left_over = (bottom**2).sum(axis=0)
+        turned = _apply(self.householder, self.tau, np.concatenate(vectors))
+        columns = min(self.householder.shape)
+        top, left_over = turned[:columns], (turned[columns:] ** 2).sum(axis=0)
         if self.left is None:
             return top, left_over
         zeta = self.left @ top
         return zeta, left_over + ((top - self.left.T @ zeta) ** 2).sum(axis=0)
 
+
+@dataclass(frozen=True)
+class _Factor:
+    """The compressed samples and the solution that axes share whose weights are equal up to a constant."""
+
+    solution: _Solution
+    levels: tuple[Cells, ...]
+    layout: Layout
+    weight: np.ndarray
+    order: np.ndarray | None
+
     def project(self, samples: np.ndarray) -> np.ndarray:
         """zeta (rank, q) of samples (n, q) in the caller's order."""
         if self.order is not None:
             samples = samples[self.order]
-        fine = compress_samples(self.layout, self.weight, samples, self.cells[0].size)
-        vectors = fine.vectors
-        for level in self.cells[1:]:
+        vectors = compress_samples(self.layout, self.weight, samples, self.levels[0].size).vectors
+        for level in self.levels[1:]:
             vectors = merge_vectors(level, vectors)
-        return self.coordinates(vectors)[0]
+        return self.solution.coordinates(vectors)[0]
 
 
 def _apply(householder: np.ndarray, tau: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -128,8 +132,8 @@ class LinearBlock:
         """T (size, rank) of c = c_0 + T zeta on one axis, in metres per standard deviation."""
         index = self._factor_of_axis[axis]
         if index not in self._memory:
-            factor = self._factors[index]
-            self._memory[index] = factor.directions.coefficients(factor.right)
+            solution = self._factors[index].solution
+            self._memory[index] = solution.directions.coefficients(solution.right)
         return self._memory[index] / self._scale[axis]
 
     def values(self, time: np.ndarray, derivative: int = 0) -> np.ndarray:
@@ -138,12 +142,12 @@ class LinearBlock:
 
     def sensitivity(self, time: np.ndarray, derivative: int, axis: int) -> np.ndarray:
         """Derivative (m, rank) of the fit with respect to zeta: basis times T."""
-        factor = self._factors[self._factor_of_axis[axis]]
+        solution = self._factors[self._factor_of_axis[axis]].solution
         time = np.atleast_1d(np.asarray(time, dtype=float))
         key = (self._factor_of_axis[axis], derivative, time.tobytes())
         if self._memory.get("sensitivity", (None,))[0] != key:
-            functions = self.frame.concentrated_basis(time, factor.directions, derivative)
-            self._memory["sensitivity"] = (key, functions @ factor.right)
+            functions = self.frame.concentrated_basis(time, solution.directions, derivative)
+            self._memory["sensitivity"] = (key, functions @ solution.right)
         return self._memory["sensitivity"][1] / self._scale[axis]
 
     def standard_deviation(self, time: np.ndarray, derivative: int, axis: int) -> np.ndarray:
@@ -152,13 +156,13 @@ class LinearBlock:
         Replaces (21) and (25) of Likhansky and Alekseev, which count 2D+1 parameters of equal weight; the ends of the
         arc are several times worse than its middle.
         """
-        factor = self._factors[self._factor_of_axis[axis]]
+        solution = self._factors[self._factor_of_axis[axis]].solution
         time = np.atleast_1d(np.asarray(time, dtype=float))
         result = np.empty(time.size)
         step = 4096
         for first in range(0, time.size, step):
-            functions = self.frame.concentrated_basis(time[first : first + step], factor.directions, derivative)
-            rows = functions @ factor.right
+            functions = self.frame.concentrated_basis(time[first : first + step], solution.directions, derivative)
+            rows = functions @ solution.right
             result[first : first + step] = np.sqrt(np.einsum("mr,mr->m", rows, rows))
         return result / self._scale[axis]
 
@@ -205,28 +209,37 @@ def compress(frame: FourierFrame, time: np.ndarray, values: np.ndarray, weights:
     axes = values.shape[1]
     groups, scale = _shared_weights(sorted_weights)
     layout = Layout.of(sorted_time, float(frame.frequencies[-1]))
+    size = polynomial_size(float(frame.frequencies[-1] * layout.half[0]))
     coefficients = np.empty((frame.size, axes))
     sum_of_squares = np.empty(axes)
     ranks = np.empty(axes, dtype=int)
     factors: list[_Factor] = []
     factor_of_axis = [0] * axes
     for members in groups:
-        weight = sorted_weights[:, members[0]]
-        amplitude = max(float(np.sqrt(weights[:, a] @ values[:, a] ** 2 / weights[:, a].sum())) * scale[a]
-                        for a in members)
-        part = sorted_values if len(members) == axes else np.ascontiguousarray(sorted_values[:, members])
-        fine = compress_samples(layout, weight, part, polynomial_size(float(frame.frequencies[-1] * layout.half[0])))
+        weight = np.ascontiguousarray(sorted_weights[:, members[0]])
+        fine = compress_samples(layout, weight, _columns(sorted_values, members), size)
         levels = _merged(frame, fine)
-        factor, zeta, left_over = _factorise(frame, levels, layout, weight, order, amplitude)
+        solution = _solve(frame, levels[-1], float(weight.sum()), _amplitude(weight, sorted_values[:, members]))
+        zeta, left_over = solution.coordinates(levels[-1].vectors)
         for position, axis in enumerate(members):
             factor_of_axis[axis] = len(factors)
-            ranks[axis] = factor.rank
-            coefficients[:, axis] = factor.directions.coefficients(factor.right @ zeta[:, position])
+            ranks[axis] = solution.rank
+            coefficients[:, axis] = solution.directions.coefficients(solution.right @ zeta[:, position])
             sum_of_squares[axis] = scale[axis] ** 2 * (levels[-1].rest[position] + left_over[position])
-        factors.append(factor)
-    used = (weights > 0.0).sum(axis=0)
+        factors.append(_Factor(solution, levels, layout, weight, order))
+    used = np.array([np.count_nonzero(weights[:, a]) for a in range(axes)])
     return LinearBlock(frame, coefficients, sum_of_squares, used - ranks, ranks, tuple(factors), tuple(factor_of_axis),
                        scale, time, values)
+
+
+def _columns(values: np.ndarray, members: list[int]) -> np.ndarray:
+    return values if len(members) == values.shape[1] else np.ascontiguousarray(values[:, members])
+
+
+def _amplitude(weight: np.ndarray, values: np.ndarray) -> float:
+    """Largest weighted root mean square of the columns."""
+    total = weight.sum()
+    return max(float(np.sqrt(np.dot(weight * column, column) / total)) for column in values.T)
 
 
 def _checked(frame: FourierFrame, time: np.ndarray, values: np.ndarray, weights: np.ndarray
@@ -243,12 +256,13 @@ def _checked(frame: FourierFrame, time: np.ndarray, values: np.ndarray, weights:
         raise ShapeError("weights have the shape of the values", where=where, value=weights.shape, limit=values.shape)
     if not np.isfinite(time).all():
         raise NotFiniteError("a time is not finite", where=f"{where}: time[{int(np.argmin(np.isfinite(time)))}]")
-    if not np.isfinite(weights).all():
+    least, most = float(weights.min()), float(weights.max())
+    if not (np.isfinite(least) and np.isfinite(most)):
         raise NotFiniteError("a weight is not finite", where=where, remedy="give a positive standard deviation")
-    if (weights < 0.0).any():
-        raise RequestError("a weight is negative", where=where, value=float(weights.min()), limit=0.0)
-    finite = np.isfinite(values)
-    if not finite.all():
+    if least < 0.0:
+        raise RequestError("a weight is negative", where=where, value=least, limit=0.0)
+    if not (np.isfinite(values.min()) and np.isfinite(values.max())):
+        finite = np.isfinite(values)
         bad = ~finite & (weights > 0.0)
         if bad.any():
             row, column = (int(i) for i in np.argwhere(bad)[0])
@@ -260,9 +274,10 @@ def _checked(frame: FourierFrame, time: np.ndarray, values: np.ndarray, weights:
         off = float(time.min() if time.min() < frame.start - slack else time.max())
         raise RequestError("a sample lies off the arc of the frame", where=where, value=f"{off} s",
                            limit=f"{frame.start} s to {frame.stop} s")
-    if not (weights.max(axis=0) > 0.0).all():
-        raise TooFewDataError("an axis has no sample of positive weight", where=where,
-                              value=f"axis {int(np.argmin(weights.max(axis=0)))}", remedy="all samples were rejected")
+    for axis in range(values.shape[1]):
+        if least == 0.0 and weights[:, axis].max() == 0.0:
+            raise TooFewDataError("an axis has no sample of positive weight", where=where, value=f"axis {axis}",
+                                  remedy="all samples were rejected; loosen the rejection or check the units")
     return time, values, weights
 
 
@@ -275,7 +290,7 @@ def _shared_weights(weights: np.ndarray) -> tuple[list[list[int]], np.ndarray]:
         for group in groups:
             first = weights[:, group[0]]
             ratio = column.sum() / first.sum()
-            if np.array_equal(column, first) or np.abs(column - ratio * first).max() <= 1e-12 * column.max():
+            if np.abs(column - ratio * first).max() <= 1e-12 * column.max():
                 scale[axis] = np.sqrt(ratio)
                 group.append(axis)
                 break
@@ -295,36 +310,25 @@ def _merged(frame: FourierFrame, fine: Cells) -> tuple[Cells, ...]:
     return fine, merge(fine, factor, polynomial_size(factor * phase))
 
 
-def _factorise(frame: FourierFrame, levels: tuple[Cells, ...], layout: Layout, weight: np.ndarray,
-               order: np.ndarray | None, amplitude: float) -> tuple[_Factor, np.ndarray, np.ndarray]:
-    """Factorise the design of merged cells; returns the factor, zeta (rank, q) and what is left over (q,)."""
-    cells = levels[-1]
-    strength = float(np.sqrt(weight.sum()))
+def _solve(frame: FourierFrame, cells: Cells, total_weight: float, amplitude: float) -> _Solution:
+    """Factorise the design of merged cells; see :func:`compress` for the directions that are left at zero."""
     # An amount of the size of the data in a direction weaker than this stays below a tenth of a standard deviation.
     weakest = _NEGLIGIBLE / amplitude if amplitude > 0.0 else 0.0
     directions = concentrated_directions(frame.degree)
-    directions = directions.above(max(_RELATIVE_TOLERANCE, weakest / (strength * float(directions.singular.max()))))
+    directions = directions.above(max(_RELATIVE_TOLERANCE,
+                                      weakest / (np.sqrt(total_weight) * float(directions.singular.max()))))
     design = _design(frame, cells, directions)
     householder, tau, _, _ = lapack.dgeqrf(design, lwork=64 * design.shape[1], overwrite_a=1)
     rows, columns = householder.shape
-    left: np.ndarray | None = None
-    right: np.ndarray | None = None
+    triangle = np.triu(householder[: min(rows, columns)])
     if rows >= columns:
-        triangle = np.triu(householder[:columns])
         reciprocal, _ = lapack.dtrcon(triangle)
         largest = float(np.abs(triangle).sum(axis=0).max())
         if reciprocal * largest > 10.0 * max(weakest, _RELATIVE_TOLERANCE * largest):
-            right = lapack.dtrtri(triangle)[0]
-    else:
-        triangle = np.triu(householder)
-    if right is None:
-        u, singular, vt = np.linalg.svd(triangle, full_matrices=False)
-        keep = singular > max(weakest, _RELATIVE_TOLERANCE * float(singular.max(initial=0.0)))
-        left = np.ascontiguousarray(u[:, keep].T)
-        right = vt[keep].T / singular[keep]
-    factor = _Factor(directions, levels, layout, weight, order, householder, tau, right, left)
-    zeta, left_over = factor.coordinates(cells.vectors)
-    return factor, zeta, left_over
+            return _Solution(directions, householder, tau, lapack.dtrtri(triangle)[0], None)
+    u, singular, vt = np.linalg.svd(triangle, full_matrices=False)
+    keep = singular > max(weakest, _RELATIVE_TOLERANCE * float(singular.max(initial=0.0)))
+    return _Solution(directions, householder, tau, vt[keep].T / singular[keep], np.ascontiguousarray(u[:, keep].T))
 
 
 def _design(frame: FourierFrame, cells: Cells, directions: Directions) -> np.ndarray:

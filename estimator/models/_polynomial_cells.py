@@ -143,6 +143,13 @@ def _is_grid(time: np.ndarray, first: float, step: float, allowed: float) -> boo
     return True
 
 
+@functools.lru_cache(maxsize=64)
+def _joint(size: int, factor: int, offset: int, longer: int) -> np.ndarray:
+    """Legendre coefficients on one of ``factor`` equal cells of the polynomials of the cell they make up."""
+    nodes, to_coefficients = gauss_rule(size)
+    return to_coefficients @ legendre((nodes + 2.0 * offset + 1.0 - factor) / factor, longer).T
+
+
 def compress_samples(layout: Layout, weight: np.ndarray, values: np.ndarray, size: int) -> Cells:
     """Compress weighted samples to one triangle a cell.
 
@@ -234,11 +241,6 @@ def merge(cells: Cells, factor: int, size: int) -> Cells:
     place = np.rint((cells.middle - cells.middle[0]) / (2.0 * cells.half[0])).astype(int)
     group_of = place // factor
     bounds = np.concatenate([[0], np.flatnonzero(np.diff(group_of)) + 1, [group_of.size]])
-    nodes, to_coefficients = gauss_rule(cells.size)
-    joints: dict[int, np.ndarray] = {}
-    for offset in range(factor):
-        u = (nodes + 2.0 * offset + 1.0 - factor) / factor
-        joints[offset] = to_coefficients @ legendre(u, size).T
     triangles, vectors = [], []
     turns: list[np.ndarray | None] = []
     groups = []
@@ -246,7 +248,8 @@ def merge(cells: Cells, factor: int, size: int) -> Cells:
     lost = cells.rows_lost
     middle = np.empty(bounds.size - 1)
     for i, (a, b) in enumerate(itertools.pairwise(bounds)):
-        block = np.concatenate([cells.triangles[c] @ joints[int(place[c] % factor)] for c in range(a, b)])
+        block = np.concatenate([cells.triangles[c] @ _joint(cells.size, factor, int(place[c] % factor), size)
+                                for c in range(a, b)])
         vector = np.concatenate([cells.vectors[c] for c in range(a, b)])
         middle[i] = cells.middle[0] + cells.half[0] * (2.0 * group_of[a] * factor + factor - 1.0)
         groups.append(slice(int(a), int(b)))
