@@ -12,8 +12,8 @@ exponential over the step, so that rate and attitude at the end of the step are 
 of the integrator, for every ratio ``tau/h`` from zero up. With ``theta = tau/h`` and ``E = exp(-1/theta)`` the two
 moments are ``theta (1 - E)`` and ``theta (theta (1 - E) - E - (1 - E)/2)``: smooth at ``theta = 0``, where their
 derivatives are 1 and -1/2, the impulse ``-tau du`` of a switch and its place at the start of the step. They are
-continued to negative ``tau`` (a lead, which no actuator has) by using ``|theta|`` inside the brackets, so that zero is
-an inner point of the fit.
+continued to negative ``tau`` (a lead, which no actuator has) by smooth bounded functions with the same value, slope and
+curvature at zero, so that zero is an inner point of the fit.
 
 The state is ``y`` at the start of the step. Its exact change over the step is given as a derivative that is zero at the
 start and the middle and six times the mean at the end of the step: a classical Runge-Kutta step then holds the state in
@@ -28,24 +28,25 @@ from estimator.effects.declaration import Parameter, Sample, declare
 from estimator.models.rotations import Matrix
 
 
-def _decay(theta: Matrix) -> Matrix:
-    """``exp(-1/|theta|)``, zero with all its derivatives at zero."""
+def _change(theta: Matrix) -> Matrix:
+    """``1 - exp(-1/|theta|)``, one with all its derivatives zero at ``theta = 0``."""
     size = ca.fabs(theta)
-    return ca.if_else(size > 2e-3, ca.exp(-1 / ca.fmax(size, 2e-3)), 0)  # exp(-500) is zero beside 1
+    return ca.if_else(size > 2e-3, -ca.expm1(-1 / ca.fmax(size, 2e-3)), 1)  # exp(-500) is zero beside 1
 
 
 def contribution(sample: Sample, p: Matrix) -> Matrix:
     """Change of the command (3, N m, actuator axes): lagged minus commanded, see the module."""
     theta = p[0] / sample.step
-    decay = _decay(theta)
-    impulse = theta * (1 - decay)
-    moment = theta * (ca.fabs(theta) * (1 - decay) - decay - (1 - decay) / 2)
+    change = _change(theta)
+    impulse = theta * change
+    bracket = ca.if_else(theta > 0, theta * change - 1 + change / 2, -0.5 / (1 + 2 * theta + 4 * theta * theta))
+    moment = theta * bracket
     return (sample.state - sample.command) * (impulse + 12 * moment * (sample.step_fraction - 0.5))
 
 
 def state_derivative(sample: Sample, p: Matrix) -> Matrix:
     """Rate (3, N m/s) that a Runge-Kutta step turns into the exact change of the lagged command over the step."""
-    change = (sample.command - sample.state) * (1 - _decay(p[0] / sample.step))
+    change = (sample.command - sample.state) * _change(p[0] / sample.step)
     return 6 * sample.step_fraction * (2 * sample.step_fraction - 1) / sample.step * change
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import casadi as ca
 
 from estimator.effects.declaration import Sample, axes, declare
+from estimator.models.radar import beam_doppler
 from estimator.models.rotations import Matrix, exponential, rotate
-from estimator.models.two_way_doppler import shift, velocity_in_antenna
+from estimator.models.two_way_doppler import velocity_in_antenna
 
 
 def contribution(sample: Sample, p: Matrix) -> Matrix:
@@ -17,7 +18,7 @@ def contribution(sample: Sample, p: Matrix) -> Matrix:
     """
     turn = ca.sin(sample.orbit_phase) * p[:3] + ca.cos(sample.orbit_phase) * p[3:]
     velocity = velocity_in_antenna(sample.earth_fixed_velocity, sample.attitude, sample.antenna_from_tracker)
-    return shift(sample.carrier_frequency, sample.beam_direction, rotate(exponential(turn), velocity) - velocity)
+    return beam_doppler(sample.beam_direction, rotate(exponential(turn), velocity) - velocity, sample.carrier_frequency)
 
 
 EFFECT = declare(

@@ -5,8 +5,9 @@ from __future__ import annotations
 import casadi as ca
 
 from estimator.effects.declaration import Effect, EffectInstance, Layout, Parameter, Sample, register
+from estimator.models.radar import SPEED_OF_LIGHT
 from estimator.models.rotations import Matrix, exponential, rotate
-from estimator.models.two_way_doppler import SPEED_OF_LIGHT, velocity_in_antenna
+from estimator.models.two_way_doppler import velocity_in_antenna
 
 NAME = "beam-mispointing"
 

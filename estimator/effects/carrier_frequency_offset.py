@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from estimator.effects.declaration import Parameter, Sample, declare
+from estimator.models.radar import beam_doppler
 from estimator.models.rotations import Matrix
-from estimator.models.two_way_doppler import shift, velocity_in_antenna
+from estimator.models.two_way_doppler import velocity_in_antenna
 
 
 def contribution(sample: Sample, p: Matrix) -> Matrix:
     """Change of the shifts (beams, Hz): the relative offset times the shift."""
     velocity = velocity_in_antenna(sample.earth_fixed_velocity, sample.attitude, sample.antenna_from_tracker)
-    return p[0] * shift(sample.carrier_frequency, sample.beam_direction, velocity)
+    return p[0] * beam_doppler(sample.beam_direction, velocity, sample.carrier_frequency)
 
 
 EFFECT = declare(

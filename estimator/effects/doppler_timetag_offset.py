@@ -6,8 +6,9 @@ import casadi as ca
 
 from estimator.effects.declaration import Parameter, Sample, declare
 from estimator.models.earth import ROTATION_RATE
+from estimator.models.radar import beam_doppler
 from estimator.models.rotations import Matrix, exponential, multiply
-from estimator.models.two_way_doppler import shift, velocity_in_antenna
+from estimator.models.two_way_doppler import velocity_in_antenna
 
 
 def contribution(sample: Sample, p: Matrix) -> Matrix:
@@ -21,7 +22,7 @@ def contribution(sample: Sample, p: Matrix) -> Matrix:
     later = sample.earth_fixed_velocity + p[0] * (sample.acceleration - frame)
     change = velocity_in_antenna(later, turned, sample.antenna_from_tracker) - velocity_in_antenna(
         sample.earth_fixed_velocity, sample.attitude, sample.antenna_from_tracker)
-    return shift(sample.carrier_frequency, sample.beam_direction, change)
+    return beam_doppler(sample.beam_direction, change, sample.carrier_frequency)
 
 
 EFFECT = declare(

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from estimator.effects.declaration import Parameter, Sample, declare
+from estimator.models.radar import beam_doppler
 from estimator.models.rotations import Matrix, about_z, rotate
-from estimator.models.two_way_doppler import shift, velocity_in_antenna
+from estimator.models.two_way_doppler import velocity_in_antenna
 
 
 def contribution(sample: Sample, p: Matrix) -> Matrix:
@@ -15,7 +16,7 @@ def contribution(sample: Sample, p: Matrix) -> Matrix:
     """
     change = rotate(about_z(p[0]), sample.earth_fixed_velocity) - sample.earth_fixed_velocity
     velocity = velocity_in_antenna(change, sample.attitude, sample.antenna_from_tracker)
-    return shift(sample.carrier_frequency, sample.beam_direction, velocity)
+    return beam_doppler(sample.beam_direction, velocity, sample.carrier_frequency)
 
 
 EFFECT = declare(

@@ -12,7 +12,8 @@ from estimator.models.rotations import Matrix, about_z, conjugate, rotate
 def contribution(sample: Sample, p: Matrix) -> Matrix:
     """Change of the measured position (3, m, Earth-fixed): that of ``t + p`` minus that of the tag ``t``.
 
-    To second order in the offset. The second derivative in the turning frame is ``a - 2 e x v' - e x (e x r)``, e the Earth's rotation.
+    To second order in the offset. The second derivative in the turning frame is ``a - 2 e x v' - e x (e x r)``, e the
+    Earth's rotation.
     """
     spin = ca.DM([0, 0, ROTATION_RATE])
     acceleration = (sample.acceleration - 2 * ca.cross(spin, sample.earth_fixed_velocity)

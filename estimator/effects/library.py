@@ -29,15 +29,16 @@ from estimator.models.errors import RequestError
 
 GROUP = "boresight.effects"
 VARIABLE = "BORESIGHT_EFFECTS"
-_MACHINERY = {"declaration", "documentation", "library"}
+_MACHINERY = {"checks", "declaration", "documentation", "library"}
 _loaded_files: set[Path] = set()
 _loaded_entry_points: set[str] = set()
 
 
-def _load_shipped() -> None:
-    for module in pkgutil.iter_modules(estimator.effects.__path__):
-        if module.name not in _MACHINERY:
-            importlib.import_module(f"estimator.effects.{module.name}")
+def shipped() -> dict[str, Effect]:
+    """The effects of this package alone, by name, in alphabetical order; every file of it defines ``EFFECT``."""
+    modules = [importlib.import_module(f"estimator.effects.{module.name}")
+               for module in pkgutil.iter_modules(estimator.effects.__path__) if module.name not in _MACHINERY]
+    return dict(sorted((module.EFFECT.name, module.EFFECT) for module in modules))
 
 
 def _withdraw(before: set[str]) -> None:
@@ -119,7 +120,7 @@ def load(places: Iterable[str | os.PathLike[str]] = ()) -> dict[str, Effect]:
     Raises:
         RequestError: a file or an entry point cannot be loaded.
     """
-    _load_shipped()
+    shipped()
     _load_entry_points()
     named = [p for p in os.environ.get(VARIABLE, "").split(os.pathsep) if p]
     for path in effect_files([*named, *places]):
@@ -164,4 +165,4 @@ def select(names: Iterable[str], layout: Layout, places: Iterable[str | os.PathL
     return tuple(chosen.values())
 
 
-__all__ = ["GROUP", "VARIABLE", "effect_files", "instances", "load", "load_file", "select"]
+__all__ = ["GROUP", "VARIABLE", "effect_files", "instances", "load", "load_file", "select", "shipped"]

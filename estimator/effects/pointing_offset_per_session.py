@@ -5,8 +5,8 @@ from __future__ import annotations
 import casadi as ca
 
 from estimator.effects.declaration import Effect, EffectInstance, Layout, Parameter, Sample, axes, register
+from estimator.models.radar import SPEED_OF_LIGHT
 from estimator.models.rotations import Matrix, exponential, rotate
-from estimator.models.two_way_doppler import SPEED_OF_LIGHT
 
 NAME = "pointing-offset-per-session"
 MARGIN = 1e-6  # s, so that a sample at the border of its session belongs to it

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from estimator.effects.declaration import Parameter, Sample, declare
+from estimator.models.radar import beam_doppler
 from estimator.models.rotations import Matrix
-from estimator.models.two_way_doppler import exact_shift, shift, velocity_in_antenna
+from estimator.models.two_way_doppler import exact_beam_doppler, velocity_in_antenna
 
 
 def contribution(sample: Sample, p: Matrix) -> Matrix:
     """Change of the shifts (beams, Hz): the scale times the exact minus the first-order shift."""
     velocity = velocity_in_antenna(sample.earth_fixed_velocity, sample.attitude, sample.antenna_from_tracker)
-    arguments = (sample.carrier_frequency, sample.beam_direction, velocity)
-    return p[0] * (exact_shift(*arguments) - shift(*arguments))
+    arguments = (sample.beam_direction, velocity, sample.carrier_frequency)
+    return p[0] * (exact_beam_doppler(*arguments) - beam_doppler(*arguments))
 
 
 EFFECT = declare(

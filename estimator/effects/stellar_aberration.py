@@ -5,8 +5,8 @@ from __future__ import annotations
 import casadi as ca
 
 from estimator.effects.declaration import Effect, EffectInstance, Layout, Parameter, Sample, register
+from estimator.models.radar import SPEED_OF_LIGHT
 from estimator.models.rotations import Matrix, rotate
-from estimator.models.two_way_doppler import SPEED_OF_LIGHT
 
 NAME = "stellar-aberration"
 

@@ -30,7 +30,6 @@ def _instances(layout: Layout) -> tuple[EffectInstance, ...]:
 EFFECT = register(Effect(
     NAME, "star_tracker",
     "At an unknown time the tracker's frame turns by a constant rotation against the rest of the body (a thermal "
-    "snap, a change of the star catalogue). Where no star tracker sample lies near the jump only the samples between which "
-    "it lies are determined.",
+    "snap, a change of the star catalogue). The data determine its time to the samples between which it lies.",
     _instances, "jump from time on",
 ))

@@ -1,8 +1,8 @@
 """A rigid body with one lightly damped vibration mode, exact in the coupling.
 
 A mode of modal coordinate ``eta`` and coupling vector ``d`` obeys ``eta'' + 2 z n eta' + n^2 eta = -d . w'`` and acts
-on the body with the torque ``-d eta'' - w x (d eta')``. The coupling enters as ``d d^T`` alone. With ``eta = d . q`` the
-three components of ``q`` obey the same equation driven by ``-w'`` without ``d``, and the torque is linear in the
+on the body with the torque ``-d eta'' - w x (d eta')``. The coupling enters as ``d d^T`` alone. With ``eta = d . q``
+the three components of ``q`` obey the same equation driven by ``-w'`` without ``d``, and the torque is linear in the
 coupling matrix ``K = d d^T``: so ``K``, which has a direction at zero while ``d`` has none, is the parameter; a matrix
 of higher rank is several modes of the same frequency. All vectors in body axes; the inertia tensor is that of the whole
 body, mode at rest.
@@ -39,9 +39,9 @@ def reaction(inertia: Matrix, rate: Matrix, other_torque: Matrix, displacement: 
         damping: ratio to critical damping.
     """
     restoring = frequency * frequency * displacement + 2 * damping * frequency * speed
-    drive = other_torque + ca.mtimes(coupling, restoring) - ca.cross(rate, ca.mtimes(coupling, speed))
-    body = solve(inertia - coupling, drive)
-    return Reaction(ca.mtimes(inertia, body) - other_torque, -restoring - body)
+    drive = ca.mtimes(coupling, restoring) - ca.cross(rate, ca.mtimes(coupling, speed))
+    body = solve(inertia - coupling, other_torque + drive)
+    return Reaction(ca.mtimes(coupling, body) + drive, -restoring - body)
 
 
 def momentum(inertia: Matrix, rate: Matrix, speed: Matrix, coupling: Matrix) -> Matrix:

@@ -2,9 +2,9 @@
 
 A mass at ``b + xi`` in body axes obeys ``xi'' + 2 w x xi' + (w' x + w x w x)(b + xi) + 2 z n xi' + n^2 xi = 0``, which
 is linear in ``xi``: ``xi = X b`` with a matrix ``X`` (3 x 3) that the rate alone drives. Its torque on the body is then
-linear in the second moment ``M = sum m b b^T`` of the moving masses: ``M`` is the parameter, for one tank or several of equal
-frequency. ``m`` is the mass reduced for the motion of the centre of mass. The inertia tensor is that of the whole body,
-masses at rest.
+linear in the second moment ``M = sum m b b^T`` of the moving masses: ``M`` is the parameter, for one tank or several
+of equal frequency. ``m`` is the mass reduced for the motion of the centre of mass. The inertia tensor is that of the
+whole body, masses at rest.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ def reaction(inertia: Matrix, rate: Matrix, other_torque: Matrix, displacement: 
     force: Matrix = frequency * frequency * displacement + 2 * damping * frequency * speed
     place = ca.DM.eye(3) + displacement
     at_rest = _inertia(moment)
-    spring = axial(ca.mtimes([place, moment, force.T]))
-    body = solve(inertia - at_rest, other_torque + spring + ca.cross(rate, ca.mtimes(at_rest, rate)))
+    drive = axial(ca.mtimes([place, moment, force.T])) + ca.cross(rate, ca.mtimes(at_rest, rate))
+    body = solve(inertia - at_rest, other_torque + drive)
     turn = skew(rate)
     coriolis: Matrix = ca.mtimes(turn, speed)
     acceleration = -force - 2 * coriolis - ca.mtimes(skew(body) + ca.mtimes(turn, turn), place)
-    return Reaction(ca.mtimes(inertia, body) - other_torque, acceleration)
+    return Reaction(ca.mtimes(at_rest, body) + drive, acceleration)
 
 
 def momentum(inertia: Matrix, rate: Matrix, displacement: Matrix, speed: Matrix, moment: Matrix) -> Matrix:

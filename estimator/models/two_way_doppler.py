@@ -1,14 +1,11 @@
-"""Doppler shift of a radar that moves with the spacecraft against a scatterer that rests on the Earth."""
+"""A radar's shift beyond its first order, and the velocity that makes it."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import casadi as ca
 
+from estimator.models.radar import SPEED_OF_LIGHT
 from estimator.models.rotations import Matrix, rotate
-
-SPEED_OF_LIGHT = 299792458.0  # m/s, exact by definition of the metre
 
 
 def velocity_in_antenna(velocity: Matrix, tracker_from_inertial: Matrix, antenna_from_tracker: Matrix) -> Matrix:
@@ -16,19 +13,13 @@ def velocity_in_antenna(velocity: Matrix, tracker_from_inertial: Matrix, antenna
     return rotate(antenna_from_tracker, rotate(tracker_from_inertial, velocity))
 
 
-def shift(carrier_frequency: Matrix, beam_direction: Matrix, velocity: Matrix) -> Matrix:
-    """First-order two-way shift ``2 f/c dot(beam, v)`` (beams, Hz), positive when moving along the beam.
+def exact_beam_doppler(beams: Matrix, velocity: Matrix, carrier_frequency: Matrix) -> Matrix:
+    """Exact two-way shift ``f (1 + beta)/(1 - beta) - f = 2 f beta/(1 - beta)`` of each beam (b, Hz).
 
     Args:
+        beams: (b, 3) unit vectors.
+        velocity: (3, m/s) relative to the ground, in the axes of the beams.
         carrier_frequency: Hz.
-        beam_direction: (beams, 3) unit vectors in antenna axes.
-        velocity: (3,) m/s against the rotating Earth, antenna axes.
     """
-    return 2 * carrier_frequency / SPEED_OF_LIGHT * ca.mtimes(beam_direction, velocity)
-
-
-def exact_shift(carrier_frequency: Matrix, beam_direction: Matrix, velocity: Matrix) -> Any:
-    """Exact two-way shift ``2 f beta/(1 - beta)`` (beams, Hz): ``f (1 + beta)/(1 - beta) - f``; arguments as
-    :func:`shift`."""
-    beta: Matrix = ca.mtimes(beam_direction, velocity) / SPEED_OF_LIGHT
+    beta: Matrix = ca.mtimes(beams, velocity / SPEED_OF_LIGHT)
     return 2 * carrier_frequency * beta / (1 - beta)
