@@ -9,13 +9,13 @@ Example:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.effects.declaration import EffectInstance, Layout
+from estimator.effects.declaration import Layout
 from estimator.models.errors import RequestError
 from problems.alignment.campaign import (
     Arc,
@@ -31,7 +31,7 @@ from problems.alignment.campaign import (
 from problems.alignment.simulation import sensors
 from problems.alignment.simulation.effects import (
     ActiveEffect,
-    EffectValues,
+    EffectChoice,
     Environment,
     TorqueEffects,
     activate,
@@ -41,7 +41,7 @@ from problems.alignment.simulation.effects import (
 )
 from problems.alignment.simulation.orbit import GRAVITATIONAL_PARAMETER, Orbit, initial_state, integrate_orbit
 from problems.alignment.simulation.pointing import Session
-from problems.alignment.simulation.rotation import RotationArc, integrate_arc, moving_body
+from problems.alignment.simulation.rotation import integrate_arc, moving_body
 from problems.alignment.simulation.scenario import PRESETS, Scenario, preset
 from problems.alignment.simulation.truth import ArcState, Truth
 
@@ -91,7 +91,7 @@ class _World:
 def simulate(
     scenario: Scenario,
     seed: int,
-    effects: Mapping[str | EffectInstance, EffectValues] | None = None,
+    effects: EffectChoice | None = None,
 ) -> tuple[Campaign, Truth]:
     """One campaign and its truth; the same arguments give the same campaign.
 
@@ -101,8 +101,8 @@ def simulate(
             and without an effect has the same noise.
         effects: the effects that are true, by name, with values in SI units in the order of the declaration (one
             number, a sequence, or a mapping by parameter; None for the values that physics demands). A key may also
-            be an :class:`EffectInstance` that no library holds. Without any, a free rotation is torque-free and only
-            the commanded torque acts in a pulse.
+            be an :class:`~estimator.effects.declaration.EffectInstance` that no library holds. Without any, a free
+            rotation is torque-free and only the commanded torque acts in a pulse.
 
     Returns:
         The campaign as measured, and the truth.
@@ -169,10 +169,11 @@ def _schedule(scenario: Scenario) -> tuple[Arc, ...]:
     arcs: list[tuple[str, ArcKind, float, float]] = []
     count = scenario.doppler_sessions
     room = last - first if count else start
-    if room < max(count - 1, 0) * (scenario.session_duration + 1.0) or (count and room < 0.0):
+    needed = max(count - 1, 0) * (scenario.session_duration + 1.0)
+    if room < needed:
         raise RequestError("the arcs do not fit into the campaign", where="scenario.duration",
                            value=f"{scenario.duration:.0f} s",
-                           limit=f"{scenario.duration - room + max(count - 1, 0) * (scenario.session_duration + 1.0):.0f} s",
+                           limit=f"about {scenario.duration - room + needed:.0f} s",
                            remedy="make the campaign longer, or its arcs fewer or shorter")
     for k, begin in enumerate(np.linspace(first, last, count)):
         begin = float(np.floor(begin))
@@ -189,7 +190,8 @@ def _layout(world: _World) -> Layout:
     period = 2.0 * np.pi * np.sqrt(scenario.semi_major_axis**3 / GRAVITATIONAL_PARAMETER)
     ends = [t for a in world.arcs for t in (a.start, a.stop)] or [0.0, scenario.duration]
     return Layout(beams=scenario.beams, sessions=sessions, span=(0.0, scenario.duration), orbital_period=float(period),
-                  tracker_span=(min(ends), max(ends)))
+                  tracker_span=(min(ends), max(ends)),
+                  beam_directions=tuple((float(x), float(y), float(z)) for x, y, z in _beams(scenario)))
 
 
 def _commands(world: _World) -> list[tuple[str, float, float, np.ndarray]]:
@@ -340,13 +342,19 @@ def _tracker(world: _World) -> tuple[TrackerSeries, np.ndarray]:
     return TrackerSeries(time, sensors.quaternions(sensors.turned(attitude, noise)), deviation), doppler
 
 
+def _beams(scenario: Scenario) -> np.ndarray:
+    """Unit vectors (beams, 3) in antenna axes, spread evenly over the cone about +z, the first in the y-z plane."""
+    azimuth = 0.5 * np.pi + 2.0 * np.pi * np.arange(scenario.beams) / scenario.beams
+    across = np.sin(scenario.beam_cone)
+    return np.stack([across * np.cos(azimuth), across * np.sin(azimuth),
+                     np.full(scenario.beams, np.cos(scenario.beam_cone))], axis=1)
+
+
 def _doppler(world: _World, time: np.ndarray) -> DopplerSeries | None:
     scenario = world.scenario
     if len(time) == 0:
         return None
-    azimuth = 0.5 * np.pi + 2.0 * np.pi * np.arange(scenario.beams) / scenario.beams
-    beams = np.stack([np.sin(scenario.beam_cone) * np.cos(azimuth), np.sin(scenario.beam_cone) * np.sin(azimuth),
-                      np.full(scenario.beams, np.cos(scenario.beam_cone))], axis=1)
+    beams = _beams(scenario)
     attitude, rate, _ = _motion(world, time)
     position, velocity = world.orbit.inertial(time)
     relative = world.orbit.relative_velocity(position, velocity)
@@ -364,7 +372,8 @@ def _doppler(world: _World, time: np.ndarray) -> DopplerSeries | None:
     shift = shift + scenario.doppler_noise_factor * deviation * world.draws["doppler"].standard_normal(shift.shape)
     draw = world.draws["doppler_outliers"]
     wrong = np.stack(np.unravel_index(sensors.chosen(shift.size, scenario.doppler_outlier_fraction, draw), shift.shape))
-    size = sensors.sizes(wrong.shape[1], scenario.outlier_size, draw) * np.where(draw.random(wrong.shape[1]) < 0.5, -1, 1)
+    sign = np.where(draw.random(wrong.shape[1]) < 0.5, -1.0, 1.0)
+    size = sign * sensors.sizes(wrong.shape[1], scenario.outlier_size, draw)
     shift[wrong[0], wrong[1]] += size * deviation[wrong[0], wrong[1]]
     world.outliers["doppler"] = wrong.T
     return DopplerSeries(time, shift, deviation, beams, scenario.carrier_frequency)

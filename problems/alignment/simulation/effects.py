@@ -6,9 +6,10 @@ itself; everything around it (where it enters, with which attitude, rate, orbit)
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +17,7 @@ import casadi as ca
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from estimator.effects.declaration import ENVIRONMENT, EffectInstance, Layout, Sample, registry
+from estimator.effects.declaration import ENVIRONMENT, EffectInstance, Layout, Sample
 from estimator.models.compiled import Mapped
 from estimator.models.errors import NotFiniteError, RequestError
 from problems.alignment.simulation.orbit import Orbit
@@ -24,8 +25,12 @@ from problems.alignment.simulation.orbit import Orbit
 EffectValues = float | Sequence[float] | Mapping[str, float] | None
 """One number, one for each parameter in order, one for each parameter by name, or None for the nominal values."""
 
+EffectChoice = Mapping[str, EffectValues] | Mapping[str | EffectInstance, EffectValues]
+"""Effects with their values: names of the library, or declarations that no library holds."""
+
 _TABLE_ONLY = ("magnetic_field", "sun", "sunlit", "density", "earth_velocity")
 _STEP = 5.0  # [s] of the environment's grid; the field along an orbit bends over hundreds of seconds
+_VANISHING_STEP = 1e-6  # [s] short against every time constant, long against rounding
 _SHADOW_STEP = 0.25  # [s] of the grid for the edge of the shadow
 
 
@@ -44,6 +49,12 @@ class ActiveEffect:
     values: np.ndarray
     used: tuple[str, ...]
     function: ca.Function
+
+    @property
+    def vanishes(self) -> bool:
+        """Whether every ordinary parameter is zero, which is the world without the effect."""
+        ordinary = [v for p, v in zip(self.instance.parameters, self.values, strict=True) if p.search is None]
+        return bool(ordinary) and not any(ordinary)
 
     def parameters(self) -> dict[str, float]:
         """Values by name of the parameter."""
@@ -76,7 +87,7 @@ def parse_effects(text: str) -> dict[str, EffectValues]:
     return effects
 
 
-def activate(effects: Mapping[str | EffectInstance, EffectValues], layout: Layout) -> tuple[ActiveEffect, ...]:
+def activate(effects: EffectChoice, layout: Layout) -> tuple[ActiveEffect, ...]:
     """The effects asked for, on a campaign of this layout.
 
     Args:
@@ -96,22 +107,13 @@ def activate(effects: Mapping[str | EffectInstance, EffectValues], layout: Layou
 
 
 def _find(name: str, layout: Layout) -> EffectInstance:
-    import importlib
+    from estimator.effects.library import select
 
-    importlib.import_module("estimator.effects")  # fills the registry
-    library = registry()
-    family = name if name in library else name.partition(":")[0]
-    if family not in library:
-        raise RequestError("there is no effect of this name", where="effects", value=name, limit=", ".join(library),
-                           remedy="choose one of these")
-    instances = library[family].instances(layout)
-    for instance in instances:
-        if instance.name == name:
-            return instance
-    if family == name and len(instances) == 1:
-        return instances[0]
-    raise RequestError("the name does not say which one", where="effects", value=name,
-                       limit=", ".join(i.name for i in instances) or "none on this campaign", remedy="choose one of these")
+    found = select([name], layout)
+    if len(found) != 1:
+        raise RequestError("the name does not say which one", where="effects", value=name,
+                           limit=", ".join(i.name for i in found), remedy="choose one of these")
+    return found[0]
 
 
 def _vector(instance: EffectInstance, values: EffectValues) -> np.ndarray:
@@ -141,18 +143,32 @@ def _active(instance: EffectInstance, values: np.ndarray, layout: Layout) -> Act
     shapes = _shapes(layout, instance.state_size)
     symbols = {name: ca.MX.sym(name, *shape) for name, shape in shapes.items()}
     p = ca.DM(values)
-    outputs = [ca.densify(ca.MX(instance.function(Sample(**symbols), p)))]
+    outputs = [_continuous(instance.function, symbols, p)]
     if instance.state_size and instance.state_derivative is not None:
-        outputs.append(ca.densify(ca.MX(instance.state_derivative(Sample(**symbols), p))))
+        outputs.append(_continuous(instance.state_derivative, symbols, p))
     whole = ca.veccat(*outputs)
     used = tuple(n for n, s in symbols.items() if n == "time" or ca.depends_on(whole, s))
     function = ca.Function("contribution", [symbols[n] for n in used], outputs, list(used),
                            ["contribution", "state_derivative"][: len(outputs)])
-    try:
+    with contextlib.suppress(RuntimeError):  # A lookup table inside keeps it as it is.
         function = function.expand()
-    except RuntimeError:
-        pass  # A lookup table inside: it stays as it is.
     return ActiveEffect(instance, values, used, function)
+
+
+def _continuous(function: Callable[[Sample, Any], Any], symbols: Mapping[str, Any], p: Any) -> Any:
+    """A function of the declaration in continuous time.
+
+    Some state-carrying effects are written for one Runge-Kutta step of known length. What the step adds, its stages
+    weighted as the method weights them, over a step of vanishing length is the equation itself, which the adaptive
+    integrator takes.
+    """
+    expression = ca.MX(function(Sample(**symbols), p))
+    if not ca.depends_on(expression, ca.vertcat(symbols["step"], symbols["step_fraction"])):
+        return ca.densify(expression)
+    stages = ((0.0, 1.0 / 6.0), (0.5, 2.0 / 3.0), (1.0, 1.0 / 6.0))
+    at = [Sample(**{**symbols, "step": ca.DM(_VANISHING_STEP), "step_fraction": ca.DM(c)}) for c, _ in stages]
+    weighted = [w * ca.MX(function(sample, p)) for sample, (_, w) in zip(at, stages, strict=True)]
+    return ca.densify(weighted[0] + weighted[1] + weighted[2])
 
 
 def _shapes(layout: Layout, states: int) -> dict[str, tuple[int, int]]:
@@ -160,7 +176,7 @@ def _shapes(layout: Layout, states: int) -> dict[str, tuple[int, int]]:
     shapes |= {"attitude": (4, 1), "rate": (3, 1), "inertia": (3, 3), "actuator_from_tracker": (4, 1),
                "command": (3, 1), "other_torque": (3, 1), "state": (max(states, 1), 1),
                "antenna_from_tracker": (4, 1), "beam_direction": (max(layout.beams, 1), 3),
-               "carrier_frequency": (1, 1), "inside_arc": (1, 1)}
+               "carrier_frequency": (1, 1), "inside_arc": (1, 1), "step": (1, 1), "step_fraction": (1, 1)}
     declared = {f.name for f in dataclasses.fields(Sample)}
     if missing := declared - set(shapes):
         raise NotImplementedError(f"the simulator does not provide these fields of a sample: {sorted(missing)}")
@@ -207,7 +223,7 @@ class Environment:
         answer: dict[str, np.ndarray] = {}
         if smooth:
             if len(time) > 8 and (time[-1] - time[0]) / _STEP < len(time):
-                count = max(int(math.ceil((time.max() - time.min()) / _STEP)) + 1, 4)
+                count = max(math.ceil((time.max() - time.min()) / _STEP) + 1, 4)
                 grid = np.linspace(time.min(), max(time.max(), time.min() + 1.0), count)
             else:
                 grid = time
@@ -229,7 +245,7 @@ class Environment:
     def along_arc(self, names: Sequence[str], start: float, stop: float) -> Any:
         """A function from one time to the fields (dict of arrays) for the right side of the rotation."""
         smooth = [n for n in names if n not in ("time", "sunlit")]
-        grid = np.linspace(start, stop, max(int(math.ceil((stop - start) / _STEP)) + 1, 4))
+        grid = np.linspace(start, stop, max(math.ceil((stop - start) / _STEP) + 1, 4))
         columns, places = [], {}
         if smooth:
             table = self.fields(smooth, grid)
@@ -243,7 +259,7 @@ class Environment:
                 columns.append(values)
             spline = CubicSpline(grid, np.concatenate(columns, axis=1))
         if "sunlit" in names:
-            fine = np.linspace(start, stop, int(math.ceil((stop - start) / _SHADOW_STEP)) + 1)
+            fine = np.linspace(start, stop, math.ceil((stop - start) / _SHADOW_STEP) + 1)
             light = self.fields(["sunlit"], fine)["sunlit"][:, 0]
 
         def at(time: float) -> dict[str, Any]:
@@ -260,13 +276,12 @@ class Environment:
 
 
 def argument_of_latitude(position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """Angle along the orbit from the ascending node (n,) rad in [0, 2 pi)."""
+    """Angle along the orbit from the ascending node (n,) rad in (-pi, pi]."""
     normal = np.cross(position, velocity)
     node = np.stack([-normal[:, 1], normal[:, 0], np.zeros(len(normal))], axis=1)
     across = np.cross(normal, node)
-    angle = np.arctan2(np.sum(position * across, axis=1) / np.linalg.norm(normal, axis=1),
-                       np.sum(position * node, axis=1))
-    return np.mod(angle, 2.0 * np.pi)
+    return np.arctan2(np.sum(position * across, axis=1) / np.linalg.norm(normal, axis=1),
+                      np.sum(position * node, axis=1))
 
 
 def contributions(
@@ -319,7 +334,7 @@ class TorqueEffects:
 
     def __init__(self, effects: Sequence[ActiveEffect], environment: Environment, inertia: np.ndarray,
                  tracker_from_actuator: np.ndarray, actuator_from_tracker: np.ndarray):
-        mine = [e for e in effects if e.instance.channel in ("command", "torque")]
+        mine = [e for e in effects if e.instance.channel in ("command", "torque") and not e.vanishes]
         self.command = [e for e in mine if e.instance.channel == "command"]
         self.free = [e for e in mine if e.instance.channel == "torque" and e.instance.state_size == 0]
         self.coupled = [e for e in mine if e.instance.channel == "torque" and e.instance.state_size > 0]
@@ -399,7 +414,9 @@ class _Call:
 
     def __init__(self, effect: ActiveEffect, constant: Mapping[str, np.ndarray]):
         function = effect.function
-        self.buffer, self.trigger = function.buffer()
+        buffer: Any
+        buffer, self.trigger = function.buffer()
+        self.buffer = buffer  # keeps the memory alive that the trigger reads
         self.inputs: dict[str, np.ndarray] = {}
         self.varying = [n for n in effect.used if n not in constant]
         for i, name in enumerate(effect.used):
@@ -407,10 +424,10 @@ class _Call:
             if name in constant:
                 array[:] = np.asarray(constant[name], dtype=float).ravel(order="F")
             self.inputs[name] = array
-            self.buffer.set_arg(i, memoryview(array))
+            buffer.set_arg(i, array.data)
         self.outputs = [np.zeros(function.numel_out(i)) for i in range(function.n_out())]
         for i, array in enumerate(self.outputs):
-            self.buffer.set_res(i, memoryview(array))
+            buffer.set_res(i, array.data)
 
     def __call__(self, fields: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray | None]:
         for name in self.varying:
@@ -423,7 +440,7 @@ def _quaternion(matrix: np.ndarray) -> np.ndarray:
     """Unit quaternion (4) ``x_from_y``, scalar first, of the matrix x_from_y (3, 3), by its largest component."""
     m = matrix
     trace = m[0, 0] + m[1, 1] + m[2, 2]
-    squares = np.array([1.0 + trace, 1.0 + 2.0 * m[0, 0] - trace, 1.0 + 2.0 * m[1, 1] - trace, 1.0 + 2.0 * m[2, 2] - trace])
+    squares = 1.0 + np.array([trace, *(2.0 * np.diag(m) - trace)])
     largest = int(np.argmax(squares))
     a, b, c = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
     d, e, f = m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1]

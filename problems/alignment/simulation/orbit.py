@@ -1,4 +1,4 @@
-"""The true orbit: two-body and zonal gravity, integrated in inertial axes; the Earth-fixed side by rotation matrices."""
+"""The true orbit: two-body and zonal gravity, integrated in inertial axes, and turned into Earth-fixed axes."""
 
 from __future__ import annotations
 
@@ -134,7 +134,8 @@ class Orbit:
         """Coordinates (n, 3) of inertial vectors (n, 3) in Earth-fixed axes."""
         angle = self.earth_angle(time)
         c, s = np.cos(angle), np.sin(angle)
-        return np.stack([c * vector[:, 0] + s * vector[:, 1], c * vector[:, 1] - s * vector[:, 0], vector[:, 2]], axis=1)
+        x, y, z = vector.T
+        return np.stack([c * x + s * y, c * y - s * x, z], axis=1)
 
     def relative_velocity(self, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
         """Velocity against the rotating Earth (n, 3) m/s, coordinates in inertial axes."""
@@ -190,7 +191,7 @@ class _Joined:
     def __call__(self, time: np.ndarray) -> np.ndarray:
         early = time < 0.0
         if not early.any():
-            return self.after(time)  # type: ignore[operator,no-any-return]
+            return self.after(time)  # type: ignore[operator]
         result = np.empty((6, len(time)))
         result[:, early] = self.before(time[early])  # type: ignore[operator]
         result[:, ~early] = self.after(time[~early])  # type: ignore[operator]

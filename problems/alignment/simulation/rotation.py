@@ -7,6 +7,7 @@ effects. Without torque the momentum stays constant to the last bit, and the rat
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -85,7 +86,7 @@ def integrate_arc(
         switches += [t for t in (first, last) if start < t < stop]
     switches = sorted(set(switches))
     pieces = []
-    for first, last in zip(switches[:-1], switches[1:], strict=True):
+    for first, last in itertools.pairwise(switches):
         middle = 0.5 * (first + last)
         command = sum((c for a, b, c in segments if a <= middle < b), np.zeros(3))
 

@@ -135,6 +135,8 @@ class Scenario:
     housekeeping: bool = False
 
     def __post_init__(self) -> None:
+        for declared in dataclasses.fields(self):
+            _require_kind(declared.name, getattr(self, declared.name), declared.default)
         for name in ("duration", "semi_major_axis", "gnss_step", "star_tracker_step", "doppler_step",
                      "carrier_frequency", "session_duration", "free_duration", "pulse_duration", "gnss_noise",
                      "doppler_noise"):
@@ -174,6 +176,32 @@ def _require(scenario: Scenario, name: str, holds: Callable[[float], bool], limi
     if not (math.isfinite(value) and holds(value)):
         raise RequestError("the number cannot be used", where=f"scenario.{name}", value=value, limit=limit,
                            remedy="change it in the scenario")
+
+
+def _require_kind(name: str, value: Any, default: Any) -> None:
+    """A text where the default is a text, a whole number where it is one, finite numbers in a tuple, and so on."""
+    number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    if isinstance(default, bool | str):
+        good = isinstance(value, type(default))
+    elif isinstance(default, int):
+        good = number and value == int(value)
+    elif isinstance(default, tuple):
+        numbers = np.asarray(_flat(value) if isinstance(value, tuple) else [None], dtype=object)
+        good = isinstance(value, tuple) and all(isinstance(x, int | float) and math.isfinite(x) for x in numbers)
+        fixed = name not in ("zonal_coefficients", "pulse_axes", "pulse_segments") and not name.endswith("_gaps")
+        good = good and (not fixed or np.shape(value) == np.shape(default))
+        row = 3 if name == "pulse_segments" else 2
+        if name == "pulse_segments" or name.endswith("_gaps"):
+            good = good and all(isinstance(x, tuple) and len(x) == row for x in value)
+    else:
+        good = number or (default is None and value is None)
+    if not good:
+        raise RequestError("the value is of the wrong kind", where=f"scenario.{name}", value=repr(value),
+                           limit=f"something like {default!r}", remedy="change it in the scenario")
+
+
+def _flat(value: Any) -> list[Any]:
+    return [x for part in value for x in _flat(part)] if isinstance(value, tuple) else [value]
 
 
 def _tilted(moments: Vector, tilt_degrees: Vector) -> Matrix3:
@@ -255,8 +283,8 @@ PRESETS: dict[str, Callable[[], Scenario]] = {
     "no-free-rotation": lambda: dataclasses.replace(Scenario(), free_arcs=0),
     "no-rotation": lambda: dataclasses.replace(Scenario(), free_arcs=0, pulse_axes=()),
 }
-"""Named scenarios: ``reference`` (6 h), ``compact`` (every channel, about 1 h), ``full`` (2 days at 0.2 s), the settings
-of the published comparison (``base`` to ``near-axisymmetric``), and campaigns that lack a kind of arc."""
+"""Named scenarios: ``reference`` (6 h), ``compact`` (every channel, about 1 h), ``full`` (2 days at 0.2 s), the
+settings of the published comparison (``base`` to ``near-axisymmetric``), and campaigns that lack a kind of arc."""
 
 
 def preset(name: str, **changes: Any) -> Scenario:
@@ -271,5 +299,6 @@ def preset(name: str, **changes: Any) -> Scenario:
     scenario = PRESETS[name]()
     known = {f.name for f in dataclasses.fields(Scenario)}
     if unknown := sorted(set(changes) - known):
-        raise RequestError("a scenario has no such number", where="preset", value=unknown, limit=", ".join(sorted(known)))
+        raise RequestError("a scenario has no such number", where="preset", value=unknown,
+                           limit=", ".join(sorted(known)))
     return dataclasses.replace(scenario, **changes)

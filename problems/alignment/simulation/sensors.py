@@ -29,11 +29,10 @@ def standard_deviations(
     nominal: np.ndarray | float, shape: tuple[int, int], variation: float, draw: np.random.Generator
 ) -> np.ndarray:
     """Declared standard deviations (n, m): the nominal ones, each sample scaled by its own factor if asked."""
-    result = np.empty(shape)
-    result[:] = nominal
-    if variation > 0.0:
-        result *= (1.0 + variation) ** draw.uniform(-1.0, 1.0, (shape[0], 1))
-    return result
+    constant = np.broadcast_to(np.asarray(nominal, dtype=float), shape)  # repeats a value without using memory
+    if variation == 0.0:
+        return constant
+    return constant * (1.0 + variation) ** draw.uniform(-1.0, 1.0, (shape[0], 1))
 
 
 def chosen(count: int, fraction: float, draw: np.random.Generator) -> np.ndarray:

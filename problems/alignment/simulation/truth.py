@@ -1,4 +1,4 @@
-"""What is true in a simulated campaign: every number that the data hide, and the trajectory and attitude as functions."""
+"""What is true in a simulated campaign: the numbers that the data hide, trajectory and attitude as functions."""
 
 from __future__ import annotations
 
