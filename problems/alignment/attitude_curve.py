@@ -189,9 +189,8 @@ def _knots(time: np.ndarray, torque_edges: Sequence[float], spacing: float) -> t
     degree = int(min(DEGREE, max(1, n // 4)))
     edges = [time[0]]
     for edge in sorted(set(torque_edges)):
-        if np.sum((time > edges[-1]) & (time <= edge)) >= 2 * FEWEST_SAMPLES_PER_INTERVAL and (
-            np.sum(time > edge) >= 2 * FEWEST_SAMPLES_PER_INTERVAL
-        ):
+        between, beyond = np.sum((time > edges[-1]) & (time <= edge)), np.sum(time > edge)
+        if min(between, beyond) >= FEWEST_SAMPLES_PER_INTERVAL:
             edges.append(edge)
     edges.append(time[-1])
     inner: list[float] = []
