@@ -40,7 +40,7 @@ from problems.readers.star_catalogue import StarCatalogue
 from problems.star_configuration.criteria import Criteria, criteria_of_information, unit_vectors
 from problems.star_configuration.optimal_directions import KeepOut
 
-_ENUMERATED = 6000
+_ENUMERATED = 300
 """Subsets up to which enumeration is faster than a relaxation."""
 
 _SAME = 1e-10
@@ -285,16 +285,6 @@ class _Problem:
         """Criterion of sums (..., 6) of information of free candidates."""
         return criterion_values(self.base + added, self.weight)
 
-    def tangent(self, total: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        """The lower bound that the tangent at ``total`` (6) gives, its best choice, and the scores (n)."""
-        inverse = np.linalg.inv(_matrix(total))
-        middle = inverse @ _matrix(self.weight) @ inverse
-        gradient = _entries(middle) * _DOUBLED
-        scores = self.information @ gradient
-        chosen = self.best(scores)
-        bound = 2 * float(np.sum(inverse * _matrix(self.weight))) - float(gradient @ self.base) - float(scores[chosen].sum())
-        return bound, chosen, scores
-
     def swaps_allowed(self, chosen: np.ndarray, others: np.ndarray) -> np.ndarray | None:
         """Mask (chosen x others) of exchanges within the quotas; None where all are."""
         if not self.binding:
@@ -356,37 +346,38 @@ def _relaxation(problem: _Problem, target: float) -> tuple[float, np.ndarray, np
 
     Returns: (lower bound, its best choice, its scores (n), fractions x (n)).
     """
-    m = problem.information
-    n, k = len(m), problem.count
-    cameras = [c for c in range(len(problem.quotas)) if np.sum(problem.camera == c) > problem.quotas[c]]
-    rows = np.vstack([np.ones(n)] + [(problem.camera == c).astype(float) for c in cameras])
-    # Strictly feasible start: an even share of each quota that leaves room in every binding one.
-    x = np.full(n, 0.0)
     sizes = np.bincount(problem.camera, minlength=len(problem.quotas))
-    room = np.minimum(sizes, problem.quotas).astype(float)
-    x = (k * room / room.sum() / np.maximum(sizes, 1))[problem.camera]
-    inequality = bool(cameras) and room.sum() > k
-    equal = rows[:1] if inequality or not cameras else rows
-    if cameras and not inequality:
-        # Every quota is filled exactly, so the total is implied by the parts when all cameras bind.
-        equal = rows[1:] if len(cameras) == len(np.unique(problem.camera)) else rows
-    capped = rows[1:] if inequality else np.zeros((0, n))
-    caps = np.array([problem.quotas[c] for c in cameras], dtype=float) if inequality else np.zeros(0)
-    x = np.clip(x, 1e-9, 1 - 1e-9)
-    best_bound, best_choice, best_scores, best_x = -np.inf, np.zeros(0, dtype=int), np.zeros(n), x
+    room = np.minimum(sizes, problem.quotas)
+    inequality = room.sum() > problem.count
+    # Where the quotas leave no choice between cameras, a camera with no more stars than its quota gives all of them.
+    forced = np.zeros(len(problem.camera), dtype=bool) if inequality else (sizes <= problem.quotas)[problem.camera]
+    m, camera = problem.information[~forced], problem.camera[~forced]
+    base = problem.base + problem.information[forced].sum(axis=0)
+    n, k = len(m), problem.count - int(forced.sum())
+    binding = [c for c in range(len(room)) if sizes[c] > problem.quotas[c]]
+    rows = np.array([camera == c for c in binding], dtype=float).reshape(-1, n)
+    # Without a choice between cameras each quota is filled exactly; else the total is, and the quotas are caps.
+    equal = np.ones((1, n)) if inequality or not binding else rows
+    capped = rows if inequality else np.zeros((0, n))
+    caps = problem.quotas[binding].astype(float) if inequality else np.zeros(0)
+    # Strictly feasible start: an even share of each camera's room.
+    share = room * (problem.count / room.sum()) / np.maximum(sizes, 1)
+    x = share[camera]
+    best_bound, best_choice, best_scores = -np.inf, np.zeros(0, dtype=int), np.zeros(len(forced))
+    best_x = np.ones(len(forced))
     weight = _matrix(problem.weight)
     low = high = cap = np.zeros(0)  # multipliers of x >= 0, x <= 1 and of the quotas
     for iteration in range(40):
-        total = problem.base + x @ m
-        inverse = np.linalg.inv(_matrix(total))
+        inverse = np.linalg.inv(_matrix(base + x @ m))
         middle = inverse @ weight @ inverse
         gradient6 = _entries(middle) * _DOUBLED
         value = float(np.sum(inverse * weight))
-        scores = m @ gradient6
+        scores = problem.information @ gradient6
         chosen = problem.best(scores)
         bound = 2 * value - float(gradient6 @ problem.base) - float(scores[chosen].sum())
         if bound > best_bound:
-            best_bound, best_choice, best_scores, best_x = bound, chosen, scores, x
+            best_bound, best_choice, best_scores = bound, chosen, scores
+            best_x[~forced] = x
         # No bound can rise above the value: stop when the rest cannot matter against what is missing to the target.
         if best_bound >= target * (1 - _SAME) or value - best_bound <= max(0.02 * (target - best_bound), 1e-9 * value):
             break
@@ -396,7 +387,7 @@ def _relaxation(problem: _Problem, target: float) -> tuple[float, np.ndarray, np
             low, high, cap = barrier / x, barrier / (1 - x), barrier / slack
         barrier = 0.15 * float(low @ x + high @ (1 - x) + cap @ slack) / (2 * n + len(caps))
         # Primal-dual Newton step: the matrix is diagonal plus rank six (plus one for each quota).
-        gradient = -scores - barrier / x + barrier / (1 - x) + capped.T @ (barrier / slack)
+        gradient = -scores[~forced] - barrier / x + barrier / (1 - x) + capped.T @ (barrier / slack)
         diagonal = low / x + high / (1 - x)
         curvature = _curvature(inverse, middle)
         root = np.linalg.cholesky(curvature + 1e-13 * np.trace(curvature) * np.eye(6))
