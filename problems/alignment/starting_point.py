@@ -872,17 +872,18 @@ def _refine_group(
         [np.full(3, 1e-5), np.full(3, 1e-7), np.full(shared, 1e-3 * size)]
     )  # rad, rad/s, 1/(kg m2)
     moves = np.diag(scaling)
-    count = len(scaling)
     best: tuple[float, list[tuple[np.ndarray, np.ndarray]], np.ndarray] = (np.inf, states, torque_map)
     for iteration in range(3):
+        # The last round only judges the step before it: one trajectory for each window.
+        count = len(scaling) if iteration < 2 else 0
         targets, jacobians = [], []
         for window, (q, w) in zip(windows, states, strict=True):
             maps = np.repeat(torque_map[None], 1 + count, axis=0)
             if shared:
-                maps[1:] += moves[:, 6:].reshape(-1, 3, 3)
-            tilts = Rotation.from_rotvec(np.concatenate([np.zeros((1, 3)), moves[:, :3]]))
+                maps[1:] += moves[:count, 6:].reshape(-1, 3, 3)
+            tilts = Rotation.from_rotvec(np.concatenate([np.zeros((1, 3)), moves[:count, :3]]))
             starts = (tilts * Rotation.from_quat(q, scalar_first=True)).as_quat(scalar_first=True)
-            error = _errors(dynamics, window, starts, w + np.concatenate([np.zeros((1, 3)), moves[:, 3:6]]), maps)
+            error = _errors(dynamics, window, starts, w + np.concatenate([np.zeros((1, 3)), moves[:count, 3:6]]), maps)
             targets.append(error[:, 0].ravel())
             jacobians.append(np.moveaxis(error[:, :1] - error[:, 1:], 1, 2).reshape(-1, count))
         scale = float(np.median(np.abs(np.concatenate(targets)))) / 0.6745
