@@ -129,11 +129,14 @@ class EarthOrientation:
         return np.array(self._at_knot(math.floor(time / self.knot))[0][2])
 
     def spin(self, times: ArrayLike) -> Array:
-        """Angular velocity (..., 3) of the Earth, rad/s, in Earth-fixed axes (along the celestial pole)."""
+        """Angular velocity (..., 3) of the Earth, rad/s, in Earth-fixed axes.
+
+        It is along the celestial pole, taken at the middle of the times: the pole moves by 1e-11 rad in an hour.
+        """
         times = np.asarray(times, float)
         rate = 2 * math.pi * 1.00273781191135448 / 86400.0
-        direction = np.stack([self._at_knot(math.floor(float(t) / self.knot))[1][:, 2] for t in times.reshape(-1)])
-        return rate * direction.reshape(*times.shape, 3)
+        middle = float(times.mean()) if times.size else 0.0
+        return np.broadcast_to(rate * self._at_knot(math.floor(middle / self.knot))[1][:, 2], (*times.shape, 3))
 
 
 def state_from_elements(semi_major_axis: float, eccentricity: float, inclination: float, node: float,
