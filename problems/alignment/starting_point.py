@@ -885,7 +885,7 @@ def _refine_group(
             starts = (tilts * Rotation.from_quat(q, scalar_first=True)).as_quat(scalar_first=True)
             error = _errors(dynamics, window, starts, w + np.concatenate([np.zeros((1, 3)), moves[:count, 3:6]]), maps)
             targets.append(error[:, 0].ravel())
-            jacobians.append(np.moveaxis(error[:, :1] - error[:, 1:], 1, 2).reshape(-1, count))
+            jacobians.append(np.moveaxis(error[:, :1] - error[:, 1:], 1, 2).reshape(3 * len(window.time), count))
         scale = float(np.median(np.abs(np.concatenate(targets)))) / 0.6745
         if scale < best[0]:
             best = (scale, states, torque_map)
