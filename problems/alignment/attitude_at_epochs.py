@@ -50,6 +50,7 @@ def attitude_at_epochs(tracker: TrackerSeries, epochs: np.ndarray) -> AttitudeAt
         left = right = np.zeros(len(epochs), dtype=int)
     nearest = np.where(np.abs(epochs - time[left]) <= np.abs(time[right] - epochs), left, right)
     coincident = np.abs(time[nearest] - epochs) <= COINCIDENT
+    epochs = np.asarray(epochs, dtype=float)
     between = (epochs >= time[left]) & (epochs <= time[right]) & (time[right] - time[left] <= LONGEST_GAP_STEPS * step)
     covered = coincident | between
     if not covered.any():
@@ -61,36 +62,38 @@ def attitude_at_epochs(tracker: TrackerSeries, epochs: np.ndarray) -> AttitudeAt
     quaternion = tracker.quaternion[nearest].copy()
     sigma = tracker.standard_deviation[nearest].copy()
     rate = np.zeros((len(epochs), 3))
-    for k in range(len(epochs)):
-        if not covered[k]:
-            continue
-        window = _window(time, stretch, epochs[k], int(nearest[k]))
-        reference = Rotation.from_quat(tracker.quaternion[nearest[k]], scalar_first=True)
+    first = np.searchsorted(stretch, stretch[nearest])
+    last = np.searchsorted(stretch, stretch[nearest], side="right")
+    sizes = np.minimum(NEIGHBOURS, last - first)
+    for size in np.unique(sizes[covered]):
+        chosen = np.flatnonzero(covered & (sizes == size))
+        begin = np.searchsorted(time, epochs[chosen]) - size // 2
+        begin = np.clip(begin, first[chosen], last[chosen] - size)
+        window = begin[:, None] + np.arange(size)
+        reference = Rotation.from_quat(tracker.quaternion[np.repeat(nearest[chosen], size)], scalar_first=True)
         # Rotation vectors of each neighbour against the nearest sample, in tracker axes.
-        vectors = (Rotation.from_quat(tracker.quaternion[window], scalar_first=True) * reference.inv()).as_rotvec()
-        offsets = time[window] - epochs[k]
-        value_weights, slope_weights = _lagrange(offsets)
-        rate[k] = -(slope_weights @ vectors)
-        if not coincident[k]:
-            quaternion[k] = (Rotation.from_rotvec(value_weights @ vectors) * reference).as_quat(scalar_first=True)
-            sigma[k] = np.sqrt((value_weights**2) @ tracker.standard_deviation[window] ** 2)
+        neighbours = Rotation.from_quat(tracker.quaternion[window.ravel()], scalar_first=True)
+        vectors = (neighbours * reference.inv()).as_rotvec().reshape(len(chosen), size, 3)
+        value_weights, slope_weights = _lagrange(time[window] - epochs[chosen][:, None])
+        rate[chosen] = -np.einsum("nk,nki->ni", slope_weights, vectors)
+        between_samples = ~coincident[chosen]
+        moved = chosen[between_samples]
+        if len(moved):
+            weights = value_weights[between_samples]
+            turn = Rotation.from_rotvec(np.einsum("nk,nki->ni", weights, vectors[between_samples]))
+            base = Rotation.from_quat(tracker.quaternion[nearest[moved]], scalar_first=True)
+            quaternion[moved] = (turn * base).as_quat(scalar_first=True)
+            variances = tracker.standard_deviation[window[between_samples]] ** 2
+            sigma[moved] = np.sqrt(np.einsum("nk,nki->ni", weights**2, variances))
     return AttitudeAtEpochs(quaternion, sigma, rate, covered)
 
 
-def _window(time: np.ndarray, stretch: np.ndarray, epoch: float, nearest: int) -> np.ndarray:
-    first = int(np.searchsorted(stretch, stretch[nearest]))
-    last = int(np.searchsorted(stretch, stretch[nearest], side="right"))
-    size = min(NEIGHBOURS, last - first)
-    start = int(np.clip(np.searchsorted(time, epoch) - size // 2, first, last - size))
-    return np.arange(start, start + size)
-
-
 def _lagrange(offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weights of the value and of the slope at zero of the polynomial through samples at ``offsets``."""
-    size = len(offsets)
+    """Weights (n, k) of the value and of the slope at zero of the polynomials through samples at ``offsets`` (n, k)."""
+    size = offsets.shape[1]
     if size == 1:
-        return np.ones(1), np.zeros(1)
-    scale = float(np.max(np.abs(offsets))) or 1.0
-    vandermonde = np.vander(offsets / scale, size, increasing=True)
+        return np.ones_like(offsets), np.zeros_like(offsets)
+    scale = np.max(np.abs(offsets), axis=1, keepdims=True)
+    vandermonde = (offsets / scale)[:, :, None] ** np.arange(size)
     inverse = np.linalg.inv(vandermonde)
-    return inverse[0], inverse[1] / scale
+    return inverse[:, 0, :], inverse[:, 1, :] / scale
