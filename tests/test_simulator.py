@@ -24,12 +24,12 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
 import problems.alignment.simulation
-from estimator.effects.declaration import EffectInstance, Parameter, Sample
+from estimator.effects.declaration import EffectInstance, Layout, Parameter, Sample
 from estimator.models.errors import NotFiniteError, RequestError
 from problems.alignment import simulator
 from problems.alignment.checks import checked
 from problems.alignment.simulation import orbit as orbit_module
-from problems.alignment.simulation.effects import argument_of_latitude
+from problems.alignment.simulation.effects import TorqueEffects, activate, argument_of_latitude
 from problems.alignment.simulation.rotation import integrate_arc, moving_body
 from problems.alignment.simulation.scenario import DEGREE
 from problems.alignment.simulator import PRESETS, parse_effects, preset, simulate
@@ -134,10 +134,7 @@ def test_any_drawn_inertia_is_that_of_a_body(seed, spread):
 def test_integrator_starts_anew_at_each_switch():
     command = np.array([0.5, 0.0, 0.0])
     inertia = np.diag([1000.0, 800.0, 600.0])
-
-    def law(_time, _matrix, _rate, torque, internal):
-        return torque, internal
-
+    law = TorqueEffects((), None, inertia, np.array([1.0, 0.0, 0.0, 0.0])).right_side(0.0, 100.0)
     arc = integrate_arc(0.0, 100.0, np.eye(3), np.zeros(3), inertia, [(20.0, 50.0, command), (60.0, 70.0, -command)],
                         law, 0)
     _, rate = arc(np.array([20.0, 35.0, 50.0, 55.0, 65.0, 100.0]))
@@ -393,7 +390,8 @@ def test_truth_is_plain_json(reference):
     assert said["seed"] == 4
     assert set(said["arc_states"]) == {a.name for a in campaign.arcs if a.kind != "doppler"}
     assert said["scenario"]["carrier_frequency"] == campaign.doppler.carrier_frequency
-    np.testing.assert_allclose(said["trajectory"]["position_earth_fixed_m"][10], truth.trajectory(np.array([600.0]))[0][0])
+    position, _ = truth.trajectory(np.array([600.0]))
+    np.testing.assert_allclose(said["trajectory"]["position_earth_fixed_m"][10], position[0])
     outside = campaign.arcs[0].start - 10.0
     with pytest.raises(RequestError, match="inside arcs"):
         truth.attitude(np.array([outside]))
@@ -571,6 +569,34 @@ def test_state_carrying_torque_sees_the_other_torques():
     assert np.linalg.norm(rate[0]) > 1e-5
 
 
+def test_flexible_mode_exchanges_momentum_and_loses_none():
+    """Body and mode together keep R (J w + K q') while each part alone does not; without damping, energy as well."""
+    inertia = np.array(preset("reference").inertia)
+    coupling = np.array([30.0, 20.0, 10.0, 4.0, -3.0, 2.0])
+    xx, yy, zz, xy, xz, yz = coupling
+    matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    frequency = 0.1  # [Hz]
+    layout = Layout(3, (), (0.0, 3600.0), 5900.0, (0.0, 3600.0))
+    active = activate({"flexible-appendage": [*coupling, frequency, 0.0]}, layout)
+    effects = TorqueEffects(active, None, inertia, np.array([1.0, 0.0, 0.0, 0.0]))
+    rate = np.array([0.5, -0.4, 0.6]) * DEGREE
+    command = np.array([0.5, 0.2, -0.3])
+    arc = integrate_arc(0.0, 300.0, np.eye(3), rate, inertia, [(0.0, 10.0, command)], effects.right_side(0.0, 300.0),
+                        effects.states)
+    time = np.linspace(10.0, 300.0, 500)
+    state = arc.state(time)
+    turn = state[:, :9].reshape(-1, 3, 3)
+    rate = np.einsum("ij,nkj,nk->ni", np.linalg.inv(inertia), np.swapaxes(turn, 1, 2), state[:, 9:12])
+    displacement, speed = state[:, 12:15], state[:, 15:18]
+    whole = state[:, 9:12] + np.einsum("nij,jk,nk->ni", turn, matrix, speed)
+    assert np.max(np.abs(whole - whole[0])) < 1e-7 * np.linalg.norm(whole[0])
+    assert np.ptp(state[:, 9]) > 1e3 * np.ptp(whole[:, 0])  # the body alone does exchange
+    energy = 0.5 * np.einsum("ni,ij,nj->n", rate, inertia, rate) + np.einsum("ni,ij,nj->n", rate, matrix, speed) \
+        + 0.5 * np.einsum("ni,ij,nj->n", speed, matrix, speed) \
+        + 0.5 * (2 * np.pi * frequency) ** 2 * np.einsum("ni,ij,nj->n", displacement, matrix, displacement)
+    assert np.ptp(energy) < 1e-7 * energy[0]
+
+
 def test_torque_map_holds_gains_of_the_actuators():
     _, truth = simulate(preset("compact"), 1, {"torque-scale-error": [0.1, -0.05, 0.02]})
     plain = matrices(truth.actuator_from_tracker).T
@@ -580,8 +606,8 @@ def test_torque_map_holds_gains_of_the_actuators():
 
 def test_effects_as_text():
     assert parse_effects("") == {}
-    assert parse_effects("a=1, b=1:2:-3e-4 ,beam:1=7;8,c") == {"a": (1.0,), "b": (1.0, 2.0, -3e-4), "beam:1": (7.0, 8.0),
-                                                              "c": None}
+    expected = {"a": (1.0,), "b": (1.0, 2.0, -3e-4), "beam:1": (7.0, 8.0), "c": None}
+    assert parse_effects("a=1, b=1:2:-3e-4 ,beam:1=7;8,c") == expected
     for text in ("a=1,a=2", "a=one", "a="):
         with pytest.raises(RequestError):
             parse_effects(text)
@@ -642,10 +668,7 @@ def test_arc_of_another_simulator_is_reproduced():
     inside = (campaign.torque.start >= arc.start) & (campaign.torque.stop <= arc.stop)
     segments = list(zip(campaign.torque.start[inside], campaign.torque.stop[inside],
                         campaign.torque.command[inside], strict=True))
-    turn = matrices(np.array(said["actuator_from_tracker"])).T
-
-    def law(_time, _matrix, _rate, command, internal):
-        return turn @ command, internal
+    law = TorqueEffects((), None, inertia, np.array(said["actuator_from_tracker"])).right_side(arc.start, arc.stop)
 
     def residual(x):
         start = (Rotation.from_rotvec(x[:3]) * measured[0]).inv().as_matrix()

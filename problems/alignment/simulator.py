@@ -116,8 +116,7 @@ def simulate(
     world = _world(scenario, _Draws(int(seed)))
     world.active = activate(effects or {}, _layout(world))
     torque = _commands(world)
-    rotation = TorqueEffects(world.active, world.environment, world.inertia, _matrix(world.actuator_from_tracker).T,
-                             world.actuator_from_tracker)
+    rotation = TorqueEffects(world.active, world.environment, world.inertia, world.actuator_from_tracker)
     arc_states = _set_in_motion(world, torque, rotation)
     campaign = _measure(world, torque)
     return campaign, _truth(world, campaign, int(seed), arc_states, rotation)
@@ -226,7 +225,7 @@ def _set_in_motion(
         rate = _tumbling(world, draw) if free else scenario.pulse_initial_rate * draw.standard_normal(3)
         segments = [(start, stop, command) for name, start, stop, command in torque if name == arc.name]
         motion = integrate_arc(arc.start, arc.stop, attitude.T, rate, world.inertia, segments,
-                               rotation.law(arc.start, arc.stop), rotation.states)
+                               rotation.right_side(arc.start, arc.stop), rotation.states)
         world.motions[arc.name] = motion
         states[arc.name] = ArcState(sensors.quaternions(attitude[None])[0], rate)
     return states

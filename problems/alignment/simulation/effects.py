@@ -16,6 +16,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
 
 from estimator.effects.declaration import ENVIRONMENT, EffectInstance, Layout, Sample
 from estimator.models.compiled import Mapped
@@ -242,37 +243,47 @@ class Environment:
         return environment_table(self.epoch, time, position, velocity, self.orbit.earth_rotation_angle_at_epoch,
                                  self.orbit.earth_rotation_rate)
 
-    def along_arc(self, names: Sequence[str], start: float, stop: float) -> Any:
-        """A function from one time to the fields (dict of arrays) for the right side of the rotation."""
-        smooth = [n for n in names if n not in ("time", "sunlit")]
-        grid = np.linspace(start, stop, max(math.ceil((stop - start) / _STEP) + 1, 4))
-        columns, places = [], {}
-        if smooth:
-            table = self.fields(smooth, grid)
-            width = 0
-            for name in smooth:
-                values = table[name]
-                if name == "orbit_phase":
-                    values = np.unwrap(values, axis=0)
-                places[name] = slice(width, width + values.shape[1])
-                width += values.shape[1]
-                columns.append(values)
-            spline = CubicSpline(grid, np.concatenate(columns, axis=1))
-        if "sunlit" in names:
-            fine = np.linspace(start, stop, math.ceil((stop - start) / _SHADOW_STEP) + 1)
-            light = self.fields(["sunlit"], fine)["sunlit"][:, 0]
+    def along_arc(self, names: Sequence[str], start: float, stop: float) -> Callable[[float], np.ndarray]:
+        """A function from one time to the stacked fields (in the order of ``names``) for the rotation's equation."""
+        if not names:
+            nothing = np.zeros(0)
+            return lambda _time: nothing
+        grid, coefficients = self._cubics([n for n in names if n != "sunlit"], start, stop)
+        if "sunlit" not in names:
+            return _PiecewiseCubic(grid, coefficients)
+        # The edge of the shadow is sharper than a cubic over seconds can follow: a straight line over a short step.
+        fine = np.linspace(start, stop, math.ceil((stop - start) / _SHADOW_STEP) + 1)
+        light = self.fields(["sunlit"], fine)["sunlit"][:, 0]
+        smooth = _PiecewiseCubic(grid, coefficients)
+        place = sum(ENVIRONMENT[n] for n in names[: list(names).index("sunlit")])
 
-        def at(time: float) -> dict[str, Any]:
-            answer: dict[str, Any] = {"time": time}
-            if smooth:
-                row = spline(time)
-                for name, place in places.items():
-                    answer[name] = row[place]
-            if "sunlit" in names:
-                answer["sunlit"] = float(np.interp(time, fine, light))
-            return answer
+        def at(time: float) -> np.ndarray:
+            return np.insert(smooth(time), place, np.interp(time, fine, light))
 
         return at
+
+    def _cubics(self, names: Sequence[str], start: float, stop: float) -> tuple[np.ndarray, np.ndarray]:
+        """Uniform knots (n) and cubic coefficients (n - 1, 4, width), highest power first."""
+        grid = np.linspace(start, stop, max(math.ceil((stop - start) / _STEP) + 1, 4))
+        if not names:
+            return grid, np.zeros((len(grid) - 1, 4, 0))
+        table = self.fields(names, grid)
+        columns = [np.unwrap(table[n], axis=0) if n == "orbit_phase" else table[n] for n in names]
+        spline = CubicSpline(grid, np.concatenate(columns, axis=1))
+        return grid, np.ascontiguousarray(np.swapaxes(spline.c, 0, 1))
+
+
+class _PiecewiseCubic:
+    """Cubics on uniform knots at one time: a tenth of the time of the general class of SciPy."""
+
+    def __init__(self, grid: np.ndarray, coefficients: np.ndarray):
+        self.start, self.step, self.last = float(grid[0]), float(grid[1] - grid[0]), len(grid) - 2
+        self.coefficients = coefficients
+
+    def __call__(self, time: float) -> np.ndarray:
+        piece = min(max(int((time - self.start) / self.step), 0), self.last)
+        x = time - self.start - piece * self.step
+        return np.array([x * x * x, x * x, x, 1.0]) @ self.coefficients[piece]
 
 
 def argument_of_latitude(position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
@@ -328,12 +339,11 @@ class TorqueEffects:
         effects: those of the channels torque and command; others are passed over.
         environment: of the campaign.
         inertia: (3, 3) kg m2.
-        tracker_from_actuator: (3, 3).
-        actuator_from_tracker: (4) the same as a quaternion.
+        actuator_from_tracker: quaternion (4).
     """
 
-    def __init__(self, effects: Sequence[ActiveEffect], environment: Environment, inertia: np.ndarray,
-                 tracker_from_actuator: np.ndarray, actuator_from_tracker: np.ndarray):
+    def __init__(self, effects: Sequence[ActiveEffect], environment: Environment | None, inertia: np.ndarray,
+                 actuator_from_tracker: np.ndarray):
         mine = [e for e in effects if e.instance.channel in ("command", "torque") and not e.vanishes]
         self.command = [e for e in mine if e.instance.channel == "command"]
         self.free = [e for e in mine if e.instance.channel == "torque" and e.instance.state_size == 0]
@@ -341,109 +351,108 @@ class TorqueEffects:
         self.states = sum(e.instance.state_size for e in mine)
         self.environment = environment
         self.inertia = inertia
-        self.tracker_from_actuator = tracker_from_actuator
-        self.constant = {"inertia": inertia, "actuator_from_tracker": actuator_from_tracker}
+        self.tracker_from_actuator = Rotation.from_quat(actuator_from_tracker, scalar_first=True).as_matrix().T
+        self.constant = {"inertia": ca.DM(inertia), "actuator_from_tracker": ca.DM(actuator_from_tracker)}
+        self.names = [n for n in ENVIRONMENT if n != "time" and any(n in e.used for e in mine)]
+        self.function = self._function()
 
-    def law(self, start: float, stop: float) -> Any:
-        """The torque law of one arc, see :data:`problems.alignment.simulation.rotation.TorqueLaw`."""
-        every = [*self.command, *self.free, *self.coupled]
-        if not every:
-            nothing = np.zeros(0)
-            turn = self.tracker_from_actuator
-            return lambda _time, _matrix, _rate, command, _internal: (turn @ command, nothing)
-        names = [n for n in ENVIRONMENT if any(n in e.used for e in every)]
-        at = self.environment.along_arc(names, start, stop)
-        calls = {id(e): _Call(e, self.constant) for e in every}
-        places, first = {}, 0
-        for e in every:
-            places[id(e)] = slice(first, first + e.instance.state_size)
-            first += e.instance.state_size
-        wants_attitude = any("attitude" in e.used for e in every)
+    def _function(self) -> ca.Function:
+        """(time, fields, state, command) to the derivative of the state, see the module ``rotation``."""
+        time, command = ca.MX.sym("time"), ca.MX.sym("command", 3)
+        stacked = ca.MX.sym("fields", sum(ENVIRONMENT[n] for n in self.names))
+        state = ca.MX.sym("state", 12 + self.states)
+        fields: dict[str, Any] = {"time": time, "command": command, **self.constant}
+        first = 0
+        for name in self.names:
+            fields[name] = stacked[first : first + ENVIRONMENT[name]]
+            first += ENVIRONMENT[name]
+        inertial_from_tracker = ca.reshape(state[:9], 3, 3).T
+        inertia = ca.DM(self.inertia)
+        rate = ca.DM(np.linalg.inv(self.inertia)) @ (inertial_from_tracker.T @ state[9:12])
+        fields |= {"rate": rate, "attitude": _quaternion(inertial_from_tracker.T)}
+        first, slopes = 12, []
 
-        def law(time: float, matrix: np.ndarray, rate: np.ndarray, command: np.ndarray,
-                internal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            fields = at(time)
-            fields["rate"], fields["command"] = rate, command
-            if wants_attitude:
-                fields["attitude"] = _quaternion(matrix.T)
-            derivative = np.empty(self.states)
+        def value(effect: ActiveEffect) -> Any:
+            nonlocal first
+            size = effect.instance.state_size
+            fields["state"] = state[first : first + size]
+            first += size
+            answers = effect.function.call([fields[n] for n in effect.used])
+            slopes.extend(answers[1:])
+            return answers[0]
 
-            def add(effect: ActiveEffect, total: np.ndarray) -> np.ndarray:
-                place = places[id(effect)]
-                if effect.instance.state_size:
-                    fields["state"] = internal[place]
-                value, slope = calls[id(effect)](fields)
-                if effect.instance.state_size:
-                    derivative[place] = slope
-                return total + value
+        acting = command
+        for effect in self.command:
+            acting = acting + value(effect)
+        torque = ca.DM(self.tracker_from_actuator) @ acting
+        for effect in self.free:
+            torque = torque + value(effect)
+        fields["other_torque"] = torque - ca.cross(rate, inertia @ rate)
+        for effect in self.coupled:
+            torque = torque + value(effect)
+        turning = inertial_from_tracker @ ca.skew(rate)
+        derivative = ca.vertcat(ca.vec(turning.T), inertial_from_tracker @ torque, *slopes)
+        function = ca.Function("rotation", [time, stacked, state, command], [ca.densify(derivative)])
+        with contextlib.suppress(RuntimeError):  # A lookup table inside keeps it as it is.
+            function = function.expand()
+        return function
 
-            acting = command
-            for effect in self.command:
-                acting = add(effect, acting)
-            torque = self.tracker_from_actuator @ acting
-            for effect in self.free:
-                torque = add(effect, torque)
-            if self.coupled:
-                fields["other_torque"] = torque - np.cross(rate, self.inertia @ rate)
-                for effect in self.coupled:
-                    torque = add(effect, torque)
-            return torque, derivative
+    def right_side(self, start: float, stop: float) -> Callable[[float, np.ndarray, np.ndarray], np.ndarray]:
+        """(time, state, command) to the derivative of the state in the arc from ``start`` to ``stop``."""
+        at: Callable[[float], np.ndarray] = lambda _time: np.zeros(0)  # noqa: E731
+        if self.environment is not None:
+            at = self.environment.along_arc(self.names, start, stop)
+        buffer: Any
+        buffer, trigger = self.function.buffer()
+        inputs = [np.zeros(self.function.numel_in(i)) for i in range(4)]
+        output = np.zeros(self.function.numel_out(0))
+        for i, array in enumerate(inputs):
+            buffer.set_arg(i, array.data)
+        buffer.set_res(0, output.data)
 
-        return law
+        def right_side(time: float, state: np.ndarray, command: np.ndarray) -> np.ndarray:
+            inputs[0][0] = time
+            inputs[1][:] = at(time)
+            inputs[2][:] = state
+            inputs[3][:] = command
+            trigger()
+            return output.copy()  # the integrator keeps what it is given
+
+        right_side.buffer = buffer  # type: ignore[attr-defined]  # keeps alive what the trigger reads
+        return right_side
 
     def command_map(self) -> np.ndarray:
         """Lasting map (3, 3) from command (actuator axes) to torque (tracker axes), with stateless command effects."""
-        columns = []
-        for axis in range(3):
-            command = np.eye(3)[axis]
-            acting = command.copy()
-            for effect in self.command:
-                if effect.instance.state_size == 0:
-                    fields = {n: np.zeros(effect.function.numel_in(n)) for n in effect.used}
-                    call = _Call(effect, self.constant)
-                    base, _ = call({**fields, "command": np.zeros(3)})
-                    base = base.copy()
-                    value, _ = call({**fields, "command": command})
-                    acting = acting + value - base
-            columns.append(self.tracker_from_actuator @ acting)
-        return np.stack(columns, axis=1)
+        acting = np.eye(3)
+        for effect in self.command:
+            if effect.instance.state_size:
+                continue
+
+            def change(command: np.ndarray, effect: ActiveEffect = effect) -> np.ndarray:
+                fields = {n: ca.DM.zeros(*effect.function.size_in(n)) for n in effect.used}
+                fields |= {n: v for n, v in self.constant.items() if n in fields}
+                if "command" in fields:
+                    fields["command"] = ca.DM(command)
+                return np.asarray(effect.function.call([fields[n] for n in effect.used])[0]).ravel()
+
+            nothing = change(np.zeros(3))
+            acting = acting + np.stack([change(column) - nothing for column in np.eye(3)], axis=1)
+        return np.asarray(self.tracker_from_actuator @ acting)
 
 
-class _Call:
-    """One effect's function on numbers, through CasADi's buffers (a call costs a few microseconds)."""
+def _quaternion(m: Any) -> Any:
+    """Unit quaternion (4) ``x_from_y``, scalar first, of the symbolic matrix x_from_y (3, 3), by its largest component.
 
-    def __init__(self, effect: ActiveEffect, constant: Mapping[str, np.ndarray]):
-        function = effect.function
-        buffer: Any
-        buffer, self.trigger = function.buffer()
-        self.buffer = buffer  # keeps the memory alive that the trigger reads
-        self.inputs: dict[str, np.ndarray] = {}
-        self.varying = [n for n in effect.used if n not in constant]
-        for i, name in enumerate(effect.used):
-            array = np.zeros(function.numel_in(i))
-            if name in constant:
-                array[:] = np.asarray(constant[name], dtype=float).ravel(order="F")
-            self.inputs[name] = array
-            buffer.set_arg(i, array.data)
-        self.outputs = [np.zeros(function.numel_out(i)) for i in range(function.n_out())]
-        for i, array in enumerate(self.outputs):
-            buffer.set_res(i, array.data)
-
-    def __call__(self, fields: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray | None]:
-        for name in self.varying:
-            self.inputs[name][:] = fields[name]
-        self.trigger()
-        return self.outputs[0], self.outputs[1] if len(self.outputs) > 1 else None
-
-
-def _quaternion(matrix: np.ndarray) -> np.ndarray:
-    """Unit quaternion (4) ``x_from_y``, scalar first, of the matrix x_from_y (3, 3), by its largest component."""
-    m = matrix
+    The sign is free.
+    """
     trace = m[0, 0] + m[1, 1] + m[2, 2]
-    squares = 1.0 + np.array([trace, *(2.0 * np.diag(m) - trace)])
-    largest = int(np.argmax(squares))
+    squares = [1.0 + trace] + [1.0 + 2.0 * m[i, i] - trace for i in range(3)]
     a, b, c = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
     d, e, f = m[0, 1] + m[1, 0], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1]
-    rows = ((squares[0], a, b, c), (a, squares[1], d, e), (b, d, squares[2], f), (c, e, f, squares[3]))
-    quaternion = np.array(rows[largest])
-    return quaternion / np.linalg.norm(quaternion)
+    rows = [(squares[0], a, b, c), (a, squares[1], d, e), (b, d, squares[2], f), (c, e, f, squares[3])]
+    largest, best = ca.vertcat(*rows[0]), squares[0]
+    for row, square in zip(rows[1:], squares[1:], strict=True):
+        larger = square > best
+        largest = ca.if_else(larger, ca.vertcat(*row), largest)
+        best = ca.fmax(square, best)
+    return largest / ca.norm_2(largest)

@@ -8,15 +8,14 @@ effects. Without torque the momentum stays constant to the last bit, and the rat
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
-TorqueLaw = Callable[[float, np.ndarray, np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""(time, inertial_from_tracker (3, 3), rate (3), commanded torque (3) in actuator axes, internal states) to the torque
-in tracker axes (3) N m and the derivative of the internal states."""
+RightSide = Callable[[float, np.ndarray, np.ndarray], np.ndarray]
+"""(time, state (12 + internal), commanded torque (3) N m in actuator axes) to the derivative of the state."""
 
 
 @dataclass(frozen=True)
@@ -62,8 +61,8 @@ def integrate_arc(
     inertial_from_tracker: np.ndarray,
     rate: np.ndarray,
     inertia: np.ndarray,
-    segments: list[tuple[float, float, np.ndarray]],
-    torque_law: TorqueLaw,
+    segments: Sequence[tuple[float, float, np.ndarray]],
+    right_side: RightSide,
     internal_states: int,
 ) -> RotationArc:
     """Integrate one arc, anew at every switch of the command.
@@ -73,14 +72,15 @@ def integrate_arc(
         inertial_from_tracker, rate: (3, 3) and (3) rad/s (tracker axes) at the start.
         inertia: (3, 3) kg m2.
         segments: (start, stop, command (3) N m in actuator axes), in order and apart.
-        torque_law: see :data:`TorqueLaw`.
+        right_side: see :data:`RightSide`.
         internal_states: how many; they start at zero.
     """
-    inverse = np.linalg.inv(inertia)
     momentum = inertial_from_tracker @ inertia @ rate
     state = np.concatenate([inertial_from_tracker.ravel(), momentum, np.zeros(internal_states)])
     scale = max(float(np.linalg.norm(momentum)), float(np.trace(inertia)) * 1e-5)
-    tolerance = np.concatenate([np.full(9, 1e-12), np.full(3, 1e-12 * scale), np.full(internal_states, 1e-10)])
+    # A mode may swing hundreds of times: 1e-10 (rad) is still a hundred thousand times below a tracker's noise.
+    relative = 1e-10 if internal_states else 1e-12
+    absolute = relative * np.concatenate([np.ones(9), np.full(3, scale), np.ones(internal_states)])
     switches = [start, stop]
     for first, last, _ in segments:
         switches += [t for t in (first, last) if start < t < stop]
@@ -89,21 +89,8 @@ def integrate_arc(
     for first, last in itertools.pairwise(switches):
         middle = 0.5 * (first + last)
         command = sum((c for a, b, c in segments if a <= middle < b), np.zeros(3))
-
-        def derivative(time: float, state: np.ndarray, command: np.ndarray = command) -> np.ndarray:
-            matrix = state[:9].reshape(3, 3)
-            body_rate = inverse @ (state[9:12] @ matrix)
-            x, y, z = body_rate.tolist()
-            torque, internal = torque_law(time, matrix, body_rate, command, state[12:])
-            result = np.empty_like(state)
-            cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-            result[:9] = (matrix @ cross).ravel()
-            result[9:12] = matrix @ torque
-            result[12:] = internal
-            return result
-
-        solution = solve_ivp(derivative, (first, last), state, method="DOP853", rtol=1e-12, atol=tolerance,
-                             dense_output=True)
+        solution = solve_ivp(right_side, (first, last), state, method="DOP853", rtol=relative, atol=absolute,
+                             dense_output=True, args=(command,))
         if not solution.success:
             raise ArithmeticError(f"the rotation arc at {first:.1f} s could not be integrated: {solution.message}")
         pieces.append((first, last, solution.sol))
