@@ -30,8 +30,9 @@ def sample_shapes(layout: Layout, state_size: int) -> dict[str, tuple[int, int]]
                      "carrier_frequency": (1, 1), "inside_arc": (1, 1)}
 
 
-def random_sample(rng: np.random.Generator, layout: Layout, state_size: int) -> dict[str, np.ndarray]:
-    """Numbers of a plausible instant in low Earth orbit, every other one inside a Doppler session if there is one."""
+def random_sample(rng: np.random.Generator, layout: Layout, state_size: int, session: int | None = None
+                  ) -> dict[str, np.ndarray]:
+    """Numbers of a plausible instant in low Earth orbit, inside the Doppler session of that index if one is given."""
 
     def unit(size: int) -> np.ndarray:
         vector = rng.standard_normal(size)
@@ -41,8 +42,7 @@ def random_sample(rng: np.random.Generator, layout: Layout, state_size: int) -> 
     if layout.beam_directions:
         beams = np.array(layout.beam_directions)
     spread = rng.standard_normal((3, 3))
-    inside = bool(layout.sessions) and rng.random() < 0.5
-    first, last = layout.sessions[rng.integers(len(layout.sessions))] if inside else layout.span
+    first, last = layout.span if session is None else layout.sessions[session]
     velocity = 7500.0 * unit(3)  # m/s
     return {
         "time": np.array(rng.uniform(first, last)), "position": 7e6 * unit(3), "velocity": velocity,
@@ -164,8 +164,9 @@ def problems_of(effect: Effect, layout: Layout, seed: int = 0, samples: int = 12
                           for p in instance.parameters])
         steps = np.minimum(steps, 1e-3)  # a time or a frequency must not leave the neighbourhood
         seen = np.zeros(len(instance.parameters))
-        for _ in range(samples):
-            sample = random_sample(rng, layout, instance.state_size)
+        places = [None, None, *range(len(layout.sessions))]
+        for k in range(max(samples, len(places))):
+            sample = random_sample(rng, layout, instance.state_size, places[k % len(places)])
             zero = at_zero(instance, rng)
             value = functions.contribution(sample, zero)
             if value.shape != (rows,):
