@@ -24,6 +24,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from estimator.models._polynomial_cells import (
+    CELL_PHASE,
     MERGED_PHASE,
     Cells,
     Layout,
@@ -38,6 +39,11 @@ from estimator.models.fourier_trajectory import Directions, FourierFrame, concen
 
 _RELATIVE_TOLERANCE = 1e-12  # of the largest singular value
 _NEGLIGIBLE = 0.1  # standard deviations
+# Length of the frame over that of the data, and largest degree: for arcs of few oscillations.
+_STRETCHED = ((16.0, 6), (4.0, 12))
+_FINEST_DEGREE = 1024  # that the first compression of the data for the choice of a degree can tell
+_LARGEST_DEGREE = 2048  # tried without being asked for
+_SMALLEST_SCALE = 0.01  # of the declared standard deviation, so that data without noise do not ask for every degree
 
 
 @dataclass(frozen=True)
@@ -62,7 +68,7 @@ class _Solution:
     def coordinates(self, vectors: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """zeta (rank, q) of right-hand sides of the merged cells, and the sum of squares (q,) left over."""
         turned = _apply(self.householder, self.tau, np.concatenate(vectors))
-        columns = min(self.householder.shape)
+        columns = self.tau.size
         top, left_over = turned[:columns], (turned[columns:] ** 2).sum(axis=0)
         if self.left is None:
             return top, left_over
@@ -328,6 +334,7 @@ def _solve(frame: FourierFrame, cells: Cells, total_weight: float, amplitude: fl
             return _Solution(directions, householder, tau, lapack.dtrtri(triangle)[0], None)
     u, singular, vt = np.linalg.svd(triangle, full_matrices=False)
     keep = singular > max(weakest, _RELATIVE_TOLERANCE * float(singular.max(initial=0.0)))
+    householder = np.asfortranarray(householder[:, : tau.size])
     return _Solution(directions, householder, tau, vt[keep].T / singular[keep], np.ascontiguousarray(u[:, keep].T))
 
 
@@ -343,3 +350,246 @@ def _design(frame: FourierFrame, cells: Cells, directions: Directions) -> np.nda
         design[first : first + rows[cell]] = (triangle @ to_coefficients) @ functions[cell]
         first += rows[cell]
     return design
+
+
+@dataclass(frozen=True)
+class DegreeTrial:
+    """One frame tried by :func:`choose_degree`.
+
+    Attributes:
+        frame: the frame.
+        parameters: determined directions over all axes, the effective number of parameters.
+        sum_of_squares: whitened residual sum of squares over all axes.
+        criterion: sum_of_squares / noise_scale^2 + 2 parameters, to be least.
+    """
+
+    frame: FourierFrame
+    parameters: int
+    sum_of_squares: float
+    criterion: float
+
+
+@dataclass(frozen=True)
+class DegreeChoice:
+    """The frame that :func:`choose_degree` takes, and why.
+
+    Attributes:
+        frame: the frame; longer than the data where these cover few oscillations.
+        noise_scale: standard deviation of the noise found in the data over the declared one.
+        explained: whether the residual of the frame is at the noise floor.
+        trials: the frames tried, by number of parameters.
+        why: the reason in one sentence.
+    """
+
+    frame: FourierFrame
+    noise_scale: float
+    explained: bool
+    trials: tuple[DegreeTrial, ...]
+    why: str
+
+
+@dataclass(frozen=True)
+class _Pyramid:
+    """Data of axes with common weights, compressed to cells of doubling length: one compression for all degrees."""
+
+    levels: tuple[Cells, ...]
+    total_weight: float
+    amplitude: float
+    scale: np.ndarray
+
+    def trial(self, frame: FourierFrame) -> tuple[int, float]:
+        """Number of parameters and whitened residual sum of squares of a fit with this frame, over the axes."""
+        frequency = float(frame.frequencies[-1])
+        cells = next(c for c in reversed(self.levels) if frequency * c.half[0] <= 1.0001 * MERGED_PHASE
+                     or c is self.levels[0])
+        solution = _solve(frame, cells, self.total_weight, self.amplitude)
+        left_over = solution.coordinates(cells.vectors)[1]
+        return solution.rank * self.scale.size, float(self.scale**2 @ (cells.rest + left_over))
+
+
+def choose_degree(time: np.ndarray, values: np.ndarray, standard_deviation: np.ndarray | float, *,
+                  start: float | None = None, stop: float | None = None,
+                  largest: int | None = None) -> DegreeChoice:
+    """The Fourier frame that predicts best: the least unbiased estimate of the squared error of the fit.
+
+    Args:
+        time: (n,) s, in any order.
+        values: (n, d) samples.
+        standard_deviation: of the samples, a number, (d,) or (n, d); infinite for rejected samples.
+        start, stop: the arc to be covered, s; by default that of the data.
+        largest: no degree above this one is tried; by default 2048.
+
+    The criterion is Mallows' C_p, residual sum of squares over noise variance plus twice the number of parameters, and
+    that number is the rank of the fit, not 2D+1. The noise is what the data show above all trajectory
+    frequencies: the residual of the polynomials to which the samples are compressed. Where there are too few samples
+    for that, the declared noise counts, or the least residual variance found if that is larger. Degrees double
+    until the residual is at the noise floor, then halve their steps around the least criterion. Among equals (within 2
+    units) the least number of parameters wins.
+
+    Arcs of few oscillations are fitted on a frame 4 or 16 times as long as they are: its low frequencies follow them
+    with fewer parameters (in the limit they are polynomials), and the number of parameters can be set finely.
+
+    Raises:
+        as :func:`compress`; TooFewDataError for fewer than 4 usable samples on an axis.
+    """
+    time = np.asarray(time, dtype=float)
+    values = np.asarray(values, dtype=float)
+    deviation = np.asarray(standard_deviation, dtype=float)
+    least = float(deviation.min()) if deviation.size else 1.0
+    if not least > 0.0:
+        raise RequestError("a standard deviation is not positive", where="choose_degree",
+                           value=least, limit="> 0")
+    if values.ndim != 2 or (deviation.ndim and deviation.shape not in (values.shape, values.shape[1:])):
+        raise ShapeError("a standard deviation is a number, one an axis, or one a value", where="choose_degree",
+                         value=deviation.shape, limit=f"() or {values.shape[1:]} or {values.shape}")
+    weights = np.array(np.broadcast_to(1.0 / deviation**2, values.shape))
+    if time.size == 0:
+        raise TooFewDataError("there are no samples", where="choose_degree", value=0, limit=4)
+    first = float(np.min(time)) if start is None else float(start)
+    last = float(np.max(time)) if stop is None else float(stop)
+    if not last > first:
+        raise TooFewDataError("all samples are at one time", where="choose_degree", value=f"{first} s",
+                              remedy="give samples over an arc")
+    time, values, weights = _checked(FourierFrame(first, last, 0), time, values, weights)
+    if weights.min() == 0.0:
+        usable = weights.max(axis=1) > 0.0
+        time, values, weights = time[usable], values[usable], weights[usable]
+    fewest = min(int(np.count_nonzero(weights[:, a])) for a in range(values.shape[1]))
+    if fewest < 4:
+        raise TooFewDataError("too few samples for a trajectory", where="choose_degree", value=fewest, limit=4)
+    if not (np.diff(time) >= 0.0).all():
+        order = np.argsort(time, kind="stable")
+        time, values, weights = time[order], values[order], weights[order]
+    search = _Search(first, last, time, values, weights, fewest, largest)
+    return search.run()
+
+
+class _Search:
+    """The search of :func:`choose_degree`: trials by degree, on data compressed once (or again, four times finer)."""
+
+    def __init__(self, start: float, stop: float, time: np.ndarray, values: np.ndarray, weights: np.ndarray,
+                 fewest: int, largest: int | None):
+        self.start, self.stop, self.time, self.values, self.weights = start, stop, time, values, weights
+        self.samples = sum(int(np.count_nonzero(weights[:, a])) for a in range(values.shape[1]))
+        self.axes = values.shape[1]
+        # Leave three tenths of few samples, half of many, as degrees of freedom.
+        self.most_parameters = self.axes * max(3, min(int(0.7 * fewest), int(0.5 * fewest) + 20))
+        self.largest = largest
+        self.trials: dict[tuple[float, int], tuple[FourierFrame, int, float]] = {}
+
+    def compress(self, finest: int) -> None:
+        """Compress the data so that frames up to degree ``finest`` can be tried, and take the noise from it."""
+        self.finest = finest
+        layout = Layout.of(self.time, np.pi * finest / (self.stop - self.start))
+        groups, scale = _shared_weights(self.weights)
+        self.pyramids = []
+        rest, lost, rows = 0.0, 0, 0
+        for members in groups:
+            weight = np.ascontiguousarray(self.weights[:, members[0]])
+            fine = compress_samples(layout, weight, _columns(self.values, members), polynomial_size(CELL_PHASE))
+            levels = [fine]
+            if len(fine.triangles) > 1:
+                levels.append(merge(fine, int(MERGED_PHASE / CELL_PHASE), polynomial_size(MERGED_PHASE)))
+            while len(levels[-1].triangles) > 1:
+                levels.append(merge(levels[-1], 2, polynomial_size(MERGED_PHASE)))
+            self.pyramids.append(_Pyramid(tuple(levels), float(weight.sum()),
+                                          _amplitude(weight, self.values[:, members]), scale[members]))
+            rest += float(scale[members] ** 2 @ fine.rest)
+            lost += fine.rows_lost * len(members)
+            rows += sum(t.shape[0] for t in fine.triangles) * len(members)
+        lost -= self.values.size - self.samples
+        self.floor, self.floor_rows = rest, rows
+        self.scale = max(np.sqrt(rest / lost), _SMALLEST_SCALE) if lost >= 60 else None
+
+    def frame(self, stretch: float, degree: int) -> FourierFrame:
+        margin = 0.5 * (stretch - 1.0) * (self.stop - self.start)
+        return FourierFrame(self.start - margin, self.stop + margin, degree)
+
+    def attempt(self, stretch: float, degree: int) -> tuple[FourierFrame, int, float]:
+        key = (stretch, degree)
+        if key not in self.trials:
+            frame = self.frame(stretch, degree)
+            parts = [p.trial(frame) for p in self.pyramids]
+            self.trials[key] = frame, sum(p[0] for p in parts), sum(p[1] for p in parts)
+        return self.trials[key]
+
+    def criterion(self, trial: tuple[FourierFrame, int, float], scale: float) -> float:
+        _, parameters, squares = trial
+        if parameters > self.most_parameters:
+            return np.inf
+        return squares / scale**2 + 2.0 * parameters
+
+    def excess(self, trial: tuple[FourierFrame, int, float], scale: float) -> tuple[float, float]:
+        """What the residual holds beyond noise, in noise variances, and the standard deviation of that number."""
+        _, parameters, squares = trial
+        free = max(self.floor_rows - parameters, 1)
+        return (squares - self.floor) / scale**2 - free, float(np.sqrt(2.0 * free))
+
+    def run(self) -> DegreeChoice:
+        upper = _LARGEST_DEGREE if self.largest is None else self.largest
+        # Cells of 80 samples keep two thirds of them as a measure of the noise.
+        room = max(8, self.most_parameters // self.axes)
+        self.compress(min(_FINEST_DEGREE, room, max(8, int(2.0 / np.pi * CELL_PHASE * self.time.size / 80.0))))
+        degree = min(8, upper)
+        while True:
+            trial = self.attempt(1.0, degree)
+            # More parameters pay only if what is left to explain is more than they cost.
+            excess, spread = self.excess(trial, self.scale or 1.0)
+            if excess + 2.0 * spread < self.axes * (degree + 20):
+                break
+            if trial[1] > self.most_parameters or degree >= upper:
+                break
+            degree = min(2 * degree, upper)
+            if degree > self.finest:
+                if self.finest >= room:
+                    break
+                self.trials.clear()
+                self.compress(min(4 * self.finest, room))
+        if degree <= 32:
+            for stretch, most in _STRETCHED:
+                for small in range(1, min(most, upper) + 1):
+                    self.attempt(stretch, small)
+        for _ in range(3):
+            self.refine(self.noise())
+        return self.choice(self.noise())
+
+    def refine(self, scale: float) -> None:
+        """Try the degrees half way (as ratios) between the best one so far and its neighbours."""
+        known = sorted(d for s, d in self.trials if s == 1.0)
+        best = min(known, key=lambda d: self.criterion(self.trials[1.0, d], scale))
+        i = known.index(best)
+        sides = known[max(i - 1, 0) : i]
+        if i + 1 < len(known):
+            # Above, only if the step explained more than the noise that its parameters take up by chance.
+            here, there = self.trials[1.0, best], self.trials[1.0, known[i + 1]]
+            more = there[1] - here[1]
+            if (here[2] - there[2]) / scale**2 > more + 3.0 * np.sqrt(2.0 * max(more, 0)):
+                sides.append(known[i + 1])
+        for neighbour in sides:
+            middle = int(np.rint(np.sqrt(best * neighbour)))
+            if middle not in known:
+                self.attempt(1.0, middle)
+
+    def noise(self) -> float:
+        """Noise over declared noise: from the compression, or bounded below by the best of the trials."""
+        if self.scale is not None:
+            return self.scale
+        variances = [squares / (self.samples - parameters) for _, parameters, squares in self.trials.values()
+                     if parameters <= self.most_parameters and parameters < self.samples]
+        return float(np.sqrt(max(1.0, min(variances, default=1.0))))
+
+    def choice(self, scale: float) -> DegreeChoice:
+        rated = sorted((DegreeTrial(*trial, self.criterion(trial, scale)) for trial in self.trials.values()),
+                       key=lambda t: (t.parameters, t.criterion))
+        least = min(t.criterion for t in rated)
+        # Where no frame has few enough parameters (least is infinite), this is the smallest one.
+        best = next(t for t in rated if t.criterion <= least + 2.0)
+        excess, spread = self.excess((best.frame, best.parameters, best.sum_of_squares), scale)
+        freedom = self.samples - best.parameters
+        explained = excess < 4.0 * spread
+        why = (f"degree {best.frame.degree} with {best.parameters} effective parameters has the least estimated error "
+               f"of {len(rated)} frames; residual variance is {best.sum_of_squares / max(freedom, 1):.3g} of the "
+               f"declared one, noise {scale**2:.3g}")
+        if not explained:
+            why += "; the residual is still above the noise, higher degrees were not possible or did not pay"
+        return DegreeChoice(best.frame, scale, bool(explained), tuple(rated), why)
