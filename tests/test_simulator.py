@@ -586,7 +586,7 @@ def test_flexible_mode_exchanges_momentum_and_loses_none():
     time = np.linspace(10.0, 300.0, 500)
     state = arc.state(time)
     turn = state[:, :9].reshape(-1, 3, 3)
-    rate = np.einsum("ij,nkj,nk->ni", np.linalg.inv(inertia), np.swapaxes(turn, 1, 2), state[:, 9:12])
+    rate = np.einsum("ij,nkj,nk->ni", np.linalg.inv(inertia), turn, state[:, 9:12])
     displacement, speed = state[:, 12:15], state[:, 15:18]
     whole = state[:, 9:12] + np.einsum("nij,jk,nk->ni", turn, matrix, speed)
     assert np.max(np.abs(whole - whole[0])) < 1e-7 * np.linalg.norm(whole[0])
