@@ -426,6 +426,11 @@ def choose_degree(time: np.ndarray, values: np.ndarray, standard_deviation: np.n
     until the residual is at the noise floor, then halve their steps around the least criterion. Among equals (within 2
     units) the least number of parameters wins.
 
+    The spectrum of a trajectory ends abruptly. Where the residual falls on and on by a little more than its
+    parameters cost, something other than a trajectory is in the data (multipath, a moving antenna), and a frame that
+    follows it would hide it. So no frame is taken that has over 1.35 times the parameters of the one with the least
+    Schwarz criterion, in which a parameter costs log(number of samples) instead of 2; ``explained`` may then be false.
+
     Arcs of few oscillations are fitted on a frame 4 or 16 times as long as they are: its low frequencies follow them
     with fewer parameters (in the limit they are polynomials), and the number of parameters can be set finely.
 
@@ -475,6 +480,7 @@ class _Search:
         # Leave three tenths of few samples, half of many, as degrees of freedom.
         self.most_parameters = self.axes * max(3, min(int(0.7 * fewest), int(0.5 * fewest) + 20))
         self.largest = largest
+        self.strict = max(2.0, float(np.log(self.samples)))  # price of a parameter in Schwarz' criterion
         self.trials: dict[tuple[float, int], tuple[FourierFrame, int, float]] = {}
 
     def compress(self, finest: int) -> None:
@@ -513,11 +519,11 @@ class _Search:
             self.trials[key] = frame, sum(p[0] for p in parts), sum(p[1] for p in parts)
         return self.trials[key]
 
-    def criterion(self, trial: tuple[FourierFrame, int, float], scale: float) -> float:
+    def criterion(self, trial: tuple[FourierFrame, int, float], scale: float, price: float = 2.0) -> float:
         _, parameters, squares = trial
         if parameters > self.most_parameters:
             return np.inf
-        return squares / scale**2 + 2.0 * parameters
+        return squares / scale**2 + price * parameters
 
     def excess(self, trial: tuple[FourierFrame, int, float], scale: float) -> tuple[float, float]:
         """What the residual holds beyond noise, in noise variances, and the standard deviation of that number."""
@@ -531,8 +537,12 @@ class _Search:
         room = max(8, self.most_parameters // self.axes)
         self.compress(min(_FINEST_DEGREE, room, max(8, int(2.0 / np.pi * CELL_PHASE * self.time.size / 80.0))))
         degree = min(8, upper)
+        ratings = []
         while True:
             trial = self.attempt(1.0, degree)
+            ratings.append(self.criterion(trial, self.scale or 1.0, self.strict))
+            if len(ratings) > 2 and ratings[-3] < min(ratings[-2:]):
+                break
             # More parameters pay only if what is left to explain is more than they cost.
             excess, spread = self.excess(trial, self.scale or 1.0)
             if excess + 2.0 * spread < self.axes * (degree + 20):
@@ -556,7 +566,7 @@ class _Search:
     def refine(self, scale: float) -> None:
         """Try the degrees half way (as ratios) between the best one so far and its neighbours."""
         known = sorted(d for s, d in self.trials if s == 1.0)
-        best = min(known, key=lambda d: self.criterion(self.trials[1.0, d], scale))
+        best = min(known, key=lambda d: self.criterion(self.trials[1.0, d], scale, self.strict))
         i = known.index(best)
         sides = known[max(i - 1, 0) : i]
         if i + 1 < len(known):
@@ -581,9 +591,11 @@ class _Search:
     def choice(self, scale: float) -> DegreeChoice:
         rated = sorted((DegreeTrial(*trial, self.criterion(trial, scale)) for trial in self.trials.values()),
                        key=lambda t: (t.parameters, t.criterion))
-        least = min(t.criterion for t in rated)
+        knee = min(self.trials.values(), key=lambda trial: self.criterion(trial, scale, self.strict))[1]
+        near = [t for t in rated if t.parameters <= max(1.35 * knee, knee + 4 * self.axes)]
+        least = min(t.criterion for t in near)
         # Where no frame has few enough parameters (least is infinite), this is the smallest one.
-        best = next(t for t in rated if t.criterion <= least + 2.0)
+        best = next(t for t in near if t.criterion <= least + 2.0)
         excess, spread = self.excess((best.frame, best.parameters, best.sum_of_squares), scale)
         freedom = self.samples - best.parameters
         explained = excess < 4.0 * spread
