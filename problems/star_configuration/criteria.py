@@ -29,6 +29,7 @@ matrices (SX, MX, DM) or NumPy arrays that CasADi accepts.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -189,6 +190,13 @@ def criteria_of_information(matrix: np.ndarray, axis: Any = (0.0, 0.0, 1.0)) -> 
         moved = blind & (1 - (vectors.T @ v) ** 2 > 1e-12)
         p_axis = float(np.sum(seen * (1 - (vectors.T @ v) ** 2)))
         return Criteria(np.inf, np.inf if np.any(moved) else p_axis, v, None, vectors.T[blind])
-    p = np.array(ca.DM(covariance(ca.DM(matrix))))
-    p = 0.5 * (p + p.T)
-    return Criteria(float(ca.DM(K0(p))), float(ca.DM(K1(ca.DM(p), ca.DM(v)))), v, p, np.zeros((0, 3)))
+    least, of_axis, p = _of_matrix()(matrix, v)
+    return Criteria(float(least), float(of_axis), v, np.array(p), np.zeros((0, 3)))
+
+
+@lru_cache(maxsize=1)
+def _of_matrix() -> ca.Function:
+    """CasADi function (information 3 x 3, axis 3) -> (K0, K1, covariance 3 x 3)."""
+    matrix, axis = ca.SX.sym("information", 3, 3), ca.SX.sym("axis", 3)
+    p = covariance(matrix)
+    return ca.Function("star_criteria_of_information", [matrix, axis], [K0(p), K1(p, axis), p])

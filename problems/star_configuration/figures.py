@@ -110,10 +110,10 @@ def _write_sphere(path: str | os.PathLike[str], title: str, directions: np.ndarr
     figure = go.Figure(traces)
     figure.update_layout(title={"text": title, "font": {"size": 15, "color": _INK}}, paper_bgcolor="white",
                          scene={"xaxis": hidden, "yaxis": hidden, "zaxis": hidden, "aspectmode": "cube",
-                                "camera": {"eye": {"x": 1.15, "y": 1.0, "z": 0.75}}},
+                                "camera": {"eye": {"x": 0.95, "y": 0.8, "z": 0.55}}},
                          legend={"x": 0.01, "y": 0.95}, margin={"l": 0, "r": 0, "t": 60, "b": 0})
     with written_atomically(path) as temporary:
-        figure.write_html(str(temporary), include_plotlyjs=True, full_html=True)
+        figure.write_html(str(temporary), include_plotlyjs=True, full_html=True, default_height="96vh")
 
 
 def _line(go: Any, points: np.ndarray, color: str, width: float, name: str, dash: str = "solid") -> Any:
@@ -136,14 +136,15 @@ def _save(figure: Any, path: str | os.PathLike[str]) -> None:
         figure.savefig(temporary, dpi=130)
 
 
-def _draw_hemispheres(figure: Any, grid: Any, title: str, directions: np.ndarray, fixed: np.ndarray, cones: Sequence[KeepOut],
-                      axis: np.ndarray) -> None:
+def _draw_hemispheres(figure: Any, directions: np.ndarray, fixed: np.ndarray, cones: Sequence[KeepOut], axis: np.ndarray) -> None:
     """Two equal-area discs, the half of the sphere with z > 0 and the half with z < 0."""
+    grid = figure.add_gridspec(1, 2)
+    entries: dict[str, Any] = {}
     for column, sign in enumerate((1.0, -1.0)):
         ax = figure.add_subplot(grid[column])
         ax.set_aspect("equal")
         ax.set_axis_off()
-        ax.set_title(f"{title}\nz > 0, seen from +z" if sign > 0 else "\nz < 0, seen from +z (through)", fontsize=10)
+        ax.set_title("z > 0, seen from +z" if sign > 0 else "z < 0, seen through from +z", fontsize=10)
         for polar in (30, 60, 90):
             radius = np.sqrt(2) * np.sin(np.radians(polar) / 2)
             angle = np.linspace(0, 2 * np.pi, 181)
@@ -166,23 +167,25 @@ def _draw_hemispheres(figure: Any, grid: Any, title: str, directions: np.ndarray
             points = flat(rows)
             if len(rows):
                 ax.scatter(points[:, 0], points[:, 1], color=color, marker=marker, s=36, label=label, zorder=3)
-        if column == 1:
-            ax.legend(loc="lower center", bbox_to_anchor=(0.5, -0.18), ncols=3, fontsize=8, frameon=False)
+        handles, labels = ax.get_legend_handles_labels()
+        entries |= dict(zip(labels, handles, strict=True))
+    figure.legend(list(entries.values()), list(entries), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
 
 
 def sphere_picture(configuration: Configuration, path: str | os.PathLike[str]) -> None:
     """Write a picture (PNG) of a configuration: both halves of the sphere in an equal-area projection."""
     figure, _ = _canvas(8.4, 4.9)
     request = configuration.request
-    _draw_hemispheres(figure, figure.add_gridspec(1, 2),
-                      f"{request.count} directions, {request.criterion}: K0 = {configuration.K0:.5g}, K1 = {configuration.K1:.5g}",
-                      configuration.directions, np.array(request.fixed).reshape(-1, 3), request.keep_outs, configuration.axis)
+    figure.suptitle(f"{request.count} directions, best for {request.criterion}: K0 = {configuration.K0:.5g}, "
+                    f"K1 = {configuration.K1:.5g} (sigma = 1)", fontsize=11)
+    _draw_hemispheres(figure, configuration.directions, np.array(request.fixed).reshape(-1, 3), request.keep_outs, configuration.axis)
     _save(figure, path)
 
 
 def sky_picture(selection: Selection, catalogue: Any, cameras: Sequence[Camera], path: str | os.PathLike[str]) -> None:
     """Write a picture (PNG) of each camera's field: visible stars by brightness, the chosen ones marked and named."""
     figure, _ = _canvas(5.2 * len(cameras), 5.6)
+    figure.suptitle(f"K0 = {selection.criteria.K0:.5g}, K1 = {selection.criteria.K1:.5g} (sigma = 1); {selection.why}", fontsize=10)
     candidates = selection.candidates
     inside = np.zeros(len(candidates), dtype=bool)
     inside[selection.chosen] = True
@@ -213,7 +216,7 @@ def sky_picture(selection: Selection, catalogue: Any, cameras: Sequence[Camera],
         ax.set_aspect("equal")
         ax.set_xlabel("across the boresight [deg]")
         ax.set_ylabel("across the boresight [deg]")
-        ax.set_title(f"{camera.name}: K0 = {selection.criteria.K0:.4g}, gap {selection.gap:.2g}", fontsize=10)
+        ax.set_title(camera.name, fontsize=10)
         ax.legend(fontsize=8, loc="upper right")
     _save(figure, path)
 
