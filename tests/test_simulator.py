@@ -552,6 +552,55 @@ def test_gravity_gradient_pulls_as_two_masses_would():
     np.testing.assert_allclose(momentum - momentum[0], impulse, atol=2e-4 * np.linalg.norm(impulse[-1]))
 
 
+def test_dipole_turns_with_the_field_of_the_common_table():
+    from estimator.models.environment import environment_table
+
+    dipole = np.array([4.0, -3.0, 6.0])  # [A m2]
+    campaign, truth = simulate(quiet(), 6, {"residual-magnetic-dipole": dipole})
+    for arc in (campaign.arcs_of_kind("free_rotation")[1], campaign.arcs_of_kind("torque_pulse")[0]):
+        time = np.linspace(arc.start, min(arc.stop, campaign.torque.start.min() - 1e-9) if arc.kind == "torque_pulse"
+                           else arc.stop, 1501)
+        attitude, rate = truth.attitude(time)
+        inertial_from_tracker = np.swapaxes(matrices(attitude), 1, 2)
+        momentum = np.einsum("nij,nj->ni", inertial_from_tracker, rate @ truth.inertia)
+        position, velocity = truth.inertial_state(time)
+        table = environment_table(campaign.epoch, time, position, velocity, campaign.earth_rotation_angle_at_epoch,
+                                  campaign.earth_rotation_rate)
+        torque = np.cross(inertial_from_tracker @ dipole, table["magnetic_field"])
+        impulse = cumulative_simpson(torque, x=time, axis=0, initial=0.0)
+        np.testing.assert_allclose(momentum - momentum[0], impulse, atol=1e-4 * np.linalg.norm(impulse[-1]))
+        assert np.linalg.norm(impulse[-1]) > 1e-4
+
+
+def test_sunlight_ends_at_the_shadow_in_a_rotation_arc():
+    """A torque that acts in sunlight alone: the impulse is that over the sunlit part of the arc."""
+    from estimator.models.environment import environment_table
+
+    def torque(sample: Sample, p):
+        return p * sample.sunlit
+
+    scenario = quiet(free_duration=1500.0, free_arcs=1, duration=4000.0, doppler_sessions=3,
+                     ascending_node=0.0)  # in March a plane through the Sun
+    p = np.array([1e-2, 0.0, 0.0])
+    crossed = 0
+    for seed in range(5):
+        campaign, truth = simulate(scenario, seed, {declared("torque", torque): p})
+        arc = campaign.arcs_of_kind("free_rotation")[0]
+        time = np.linspace(arc.start, arc.stop, 6001)
+        position, velocity = truth.inertial_state(time)
+        light = environment_table(campaign.epoch, time, position, velocity, campaign.earth_rotation_angle_at_epoch,
+                                  campaign.earth_rotation_rate)["sunlit"]
+        if light.min() == light.max():
+            continue
+        crossed += 1
+        attitude, rate = truth.attitude(time)
+        inertial_from_tracker = np.swapaxes(matrices(attitude), 1, 2)
+        momentum = np.einsum("nij,nj->ni", inertial_from_tracker, rate @ truth.inertia)
+        impulse = cumulative_simpson(light[:, None] * (inertial_from_tracker @ p), x=time, axis=0, initial=0.0)
+        np.testing.assert_allclose(momentum - momentum[0], impulse, atol=1e-5)  # [N m s], a millisecond of 0.01 N m
+    assert crossed >= 2
+
+
 def test_state_carrying_torque_sees_the_other_torques():
     """A locked mode: a torque of minus all other torques plus the gyroscopic one holds the rate."""
     def torque(sample: Sample, p):

@@ -123,7 +123,7 @@ def simulate(
 
 
 def _matrix(quaternion: np.ndarray) -> np.ndarray:
-    """Matrix (3, 3) that takes coordinates from y to x, of the quaternion x_from_y."""
+    """Matrix (..., 3, 3) that takes coordinates from y to x, of the quaternion x_from_y (..., 4)."""
     return np.asarray(Rotation.from_quat(quaternion, scalar_first=True).as_matrix())
 
 
@@ -147,8 +147,10 @@ def _world(scenario: Scenario, draws: _Draws) -> _World:
         for error, nominal in zip(errors, (scenario.antenna_from_tracker, scenario.actuator_from_tracker), strict=True)
     ]
     inertia = moving_body(np.array(scenario.inertia), scenario.inertia_spread, draws["inertia"])
-    return _World(scenario, draws, orbit, mountings[0], mountings[1], inertia, _schedule(scenario),
-                  Environment(orbit, scenario.epoch))
+    arcs = _schedule(scenario)
+    spans = [(a.start, a.stop) for a in arcs if a.kind != "doppler"]
+    return _World(scenario, draws, orbit, mountings[0], mountings[1], inertia, arcs,
+                  Environment(orbit, scenario.epoch, spans, scenario.duration))
 
 
 def _schedule(scenario: Scenario) -> tuple[Arc, ...]:
@@ -242,15 +244,20 @@ def _tumbling(world: _World, draw: np.random.Generator) -> np.ndarray:
 
 
 def _motion(world: _World, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Attitude (n, 3, 3), rate (n, 3), and 1 inside arcs (n,); outside the attitude is the unit matrix."""
-    attitude = np.tile(np.eye(3), (len(time), 1, 1))
+    """Quaternion ``tracker_from_inertial`` (n, 4), rate (n, 3), and 1 inside arcs (n, 1), at increasing times.
+
+    Outside arcs the quaternion is (1, 0, 0, 0), the rate and the mark are zero.
+    """
+    attitude = np.zeros((len(time), 4))
+    attitude[:, 0] = 1.0
     rate = np.zeros((len(time), 3))
-    inside = np.zeros(len(time))
+    inside = np.zeros((len(time), 1))
     for arc in world.arcs:
-        mask = (time >= arc.start) & (time <= arc.stop)
-        if mask.any():
-            attitude[mask], rate[mask] = world.motions[arc.name](time[mask])
-            inside[mask] = 1.0
+        first, last = np.searchsorted(time, arc.start, "left"), np.searchsorted(time, arc.stop, "right")
+        if first < last:
+            matrix, rate[first:last] = world.motions[arc.name](time[first:last])
+            attitude[first:last] = sensors.quaternions(matrix)
+            inside[first:last] = 1.0
     return attitude, rate, inside
 
 
@@ -287,7 +294,7 @@ def _gnss(world: _World) -> GnssSeries:
         sampled = {}
         if any({"attitude", "rate", "inside_arc"} & set(e.used) for e in effects):
             attitude, rate, inside = _motion(world, time)
-            sampled = {"attitude": sensors.quaternions(attitude), "rate": rate, "inside_arc": inside[:, None]}
+            sampled = {"attitude": attitude, "rate": rate, "inside_arc": inside}
         position += contributions(effects, world.environment, time, 3, {}, sampled)
     deviation = sensors.standard_deviations(scenario.gnss_noise, position.shape, scenario.noise_variation,
                                             world.draws["gnss_accuracy"])
@@ -358,13 +365,13 @@ def _doppler(world: _World, time: np.ndarray) -> DopplerSeries | None:
     position, velocity = world.orbit.inertial(time)
     relative = world.orbit.relative_velocity(position, velocity)
     # The beams are carried into inertial axes, where the velocity is.
-    inertial_from_antenna = np.swapaxes(attitude, 1, 2) @ _matrix(world.antenna_from_tracker).T
+    inertial_from_antenna = np.swapaxes(_matrix(attitude), 1, 2) @ _matrix(world.antenna_from_tracker).T
     carried = np.einsum("nij,bj->nbi", inertial_from_antenna, beams)
     shift = 2.0 * scenario.carrier_frequency / SPEED_OF_LIGHT * np.einsum("nbi,ni->nb", carried, relative)
     if effects := world.of_channel("doppler"):
         constant = {"antenna_from_tracker": world.antenna_from_tracker, "beam_direction": beams,
                     "carrier_frequency": np.array([scenario.carrier_frequency])}
-        sampled = {"attitude": sensors.quaternions(attitude), "rate": rate}
+        sampled = {"attitude": attitude, "rate": rate}
         shift = shift + contributions(effects, world.environment, time, scenario.beams, constant, sampled)
     deviation = sensors.standard_deviations(scenario.doppler_noise, shift.shape, scenario.noise_variation,
                                             world.draws["doppler_accuracy"])
@@ -396,11 +403,14 @@ def _truth(world: _World, campaign: Campaign, seed: int, arc_states: dict[str, A
     scenario = world.scenario
 
     def attitude(time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        matrices, rate, inside = _motion(world, np.asarray(time, dtype=float))
+        asked = np.asarray(time, dtype=float)
+        order = np.argsort(asked, kind="stable")
+        back = np.argsort(order, kind="stable")
+        quaternion, rate, inside = (part[back] for part in _motion(world, asked[order]))
         if not inside.all():
             raise RequestError("the true attitude is known inside arcs alone", where="time",
-                               value=float(np.asarray(time)[inside == 0.0][0]), limit="a time inside an arc")
-        return sensors.quaternions(matrices), rate
+                               value=float(asked[inside[:, 0] == 0.0][0]), limit="a time inside an arc")
+        return quaternion, rate
 
     return Truth(
         seed=seed,

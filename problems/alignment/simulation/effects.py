@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -29,7 +30,6 @@ EffectValues = float | Sequence[float] | Mapping[str, float] | None
 EffectChoice = Mapping[str, EffectValues] | Mapping[str | EffectInstance, EffectValues]
 """Effects with their values: names of the library, or declarations that no library holds."""
 
-_TABLE_ONLY = ("magnetic_field", "sun", "sunlit", "density", "earth_velocity")
 _STEP = 5.0  # [s] of the environment's grid; the field along an orbit bends over hundreds of seconds
 _VANISHING_STEP = 1e-6  # [s] short against every time constant, long against rounding
 _SHADOW_STEP = 0.25  # [s] of the grid for the edge of the shadow
@@ -188,89 +188,107 @@ class Environment:
     """What an effect may ask of time and orbit, on the true orbit.
 
     Position, velocity and what follows from them are the simulator's own; the magnetic field, the Sun, the shadow,
-    the atmosphere and the Earth's motion come from the common table.
+    the atmosphere and the Earth's motion come from the common functions.
+
+    Args:
+        orbit: the true orbit.
+        epoch: UTC, ISO 8601.
+        spans: (start, stop) of each rotation arc, s after the epoch.
+        duration: s, of the campaign.
     """
 
-    def __init__(self, orbit: Orbit, epoch: str):
+    def __init__(self, orbit: Orbit, epoch: str, spans: Sequence[tuple[float, float]], duration: float):
         self.orbit = orbit
         self.epoch = epoch
+        self.spans = tuple(spans)
+        self.duration = duration
+        self._along: dict[tuple[str, ...], list[tuple[np.ndarray, np.ndarray]]] = {}
+
+    @functools.cached_property
+    def _heaven(self) -> CubicSpline:
+        """Velocity of the Earth and place of the Sun from the Earth (6) over the campaign."""
+        from estimator.models.environment import earth_and_sun
+
+        margin = 400.0  # [s]
+        knots = np.linspace(-margin, self.duration + margin, max(math.ceil(self.duration / 600.0), 8))
+        return CubicSpline(knots, np.concatenate(earth_and_sun(self.epoch, knots), axis=1))
 
     def fields(self, names: Sequence[str], time: np.ndarray) -> dict[str, np.ndarray]:
         """Arrays (n, size) of the fields at ``time`` (n,)."""
         position, velocity = self.orbit.inertial(time)
-        answer: dict[str, np.ndarray] = {}
-        for name in names:
-            if name == "time":
-                answer[name] = time[:, None]
-            elif name == "position":
-                answer[name] = position
-            elif name == "velocity":
-                answer[name] = velocity
-            elif name == "acceleration":
-                answer[name] = self.orbit.acceleration(position)
-            elif name == "earth_fixed_velocity":
-                answer[name] = self.orbit.relative_velocity(position, velocity)
-            elif name == "earth_angle":
-                answer[name] = self.orbit.earth_angle(time)[:, None]
-            elif name == "orbit_phase":
-                answer[name] = argument_of_latitude(position, velocity)[:, None]
-        asked = [n for n in names if n in _TABLE_ONLY]
-        if asked:
-            answer |= self._interpolated(asked, time)
-        return answer
+        every: dict[str, Callable[[], np.ndarray]] = {
+            "time": lambda: time,
+            "position": lambda: position,
+            "velocity": lambda: velocity,
+            "acceleration": lambda: self.orbit.acceleration(position),
+            "earth_fixed_velocity": lambda: self.orbit.relative_velocity(position, velocity),
+            "earth_angle": lambda: self.orbit.earth_angle(time),
+            "orbit_phase": lambda: argument_of_latitude(position, velocity),
+            "magnetic_field": lambda: self._magnetic_field(time),
+            "sun": lambda: self._sun(time, position)[0],
+            "sunlit": lambda: self._sunlit(time, position),
+            "density": lambda: self._density(position),
+            "earth_velocity": lambda: self._heaven(time)[:, :3],
+        }
+        return {name: every[name]().reshape(len(time), ENVIRONMENT[name]) for name in names}
 
-    def _interpolated(self, names: Sequence[str], time: np.ndarray) -> dict[str, np.ndarray]:
-        smooth = [n for n in names if n != "sunlit"]
-        answer: dict[str, np.ndarray] = {}
-        if smooth:
-            if len(time) > 8 and (time[-1] - time[0]) / _STEP < len(time):
-                count = max(math.ceil((time.max() - time.min()) / _STEP) + 1, 4)
-                grid = np.linspace(time.min(), max(time.max(), time.min() + 1.0), count)
-            else:
-                grid = time
-            table = self._table(grid)
-            for name in smooth:
-                values = np.asarray(table[name], dtype=float).reshape(len(grid), -1)
-                answer[name] = values if grid is time else CubicSpline(grid, values)(time)
-        if "sunlit" in names:
-            answer["sunlit"] = np.asarray(self._table(time)["sunlit"], dtype=float).reshape(len(time), 1)
-        return answer
+    def _magnetic_field(self, time: np.ndarray) -> np.ndarray:
+        """In inertial axes; on a grid where the samples are denser than that."""
+        from estimator.models.environment import geomagnetic_field
 
-    def _table(self, time: np.ndarray) -> dict[str, np.ndarray]:
-        from estimator.models.environment import environment_table
+        count = math.ceil((time[-1] - time[0]) / _STEP) + 1 if len(time) else 0
+        dense = 4 <= count < len(time)
+        grid = np.linspace(time.min(), time.max(), count) if dense else time
+        position, _ = self.orbit.inertial(grid)
+        fixed = geomagnetic_field(self.epoch, grid, self.orbit.to_earth_fixed(grid, position))
+        if dense:
+            fixed = CubicSpline(grid, fixed)(time)
+        return self.orbit.from_earth_fixed(time, fixed)
 
-        position, velocity = self.orbit.inertial(time)
-        return environment_table(self.epoch, time, position, velocity, self.orbit.earth_rotation_angle_at_epoch,
-                                 self.orbit.earth_rotation_rate)
+    def _sun(self, time: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Unit vectors to the Sun (n, 3) and its distance (n,) m."""
+        towards = self._heaven(time)[:, 3:] - position
+        distance = np.linalg.norm(towards, axis=1)
+        return towards / distance[:, None], distance
+
+    def _sunlit(self, time: np.ndarray, position: np.ndarray) -> np.ndarray:
+        from estimator.models.environment import sunlit
+
+        return sunlit(position, *self._sun(time, position))
+
+    def _density(self, position: np.ndarray) -> np.ndarray:
+        from estimator.models.environment import density
+
+        return density(position)
 
     def along_arc(self, names: Sequence[str], start: float, stop: float) -> Callable[[float], np.ndarray]:
         """A function from one time to the stacked fields (in the order of ``names``) for the rotation's equation."""
         if not names:
             nothing = np.zeros(0)
             return lambda _time: nothing
-        grid, coefficients = self._cubics([n for n in names if n != "sunlit"], start, stop)
+        smooth = tuple(n for n in names if n != "sunlit")
+        if smooth not in self._along:
+            self._along[smooth] = self._cubics(smooth)
+        cubic = _PiecewiseCubic(*self._along[smooth][self.spans.index((start, stop))])
         if "sunlit" not in names:
-            return _PiecewiseCubic(grid, coefficients)
+            return cubic
         # The edge of the shadow is sharper than a cubic over seconds can follow: a straight line over a short step.
         fine = np.linspace(start, stop, math.ceil((stop - start) / _SHADOW_STEP) + 1)
         light = self.fields(["sunlit"], fine)["sunlit"][:, 0]
-        smooth = _PiecewiseCubic(grid, coefficients)
         place = sum(ENVIRONMENT[n] for n in names[: list(names).index("sunlit")])
+        return lambda time: np.insert(cubic(time), place, np.interp(time, fine, light))
 
-        def at(time: float) -> np.ndarray:
-            return np.insert(smooth(time), place, np.interp(time, fine, light))
-
-        return at
-
-    def _cubics(self, names: Sequence[str], start: float, stop: float) -> tuple[np.ndarray, np.ndarray]:
-        """Uniform knots (n) and cubic coefficients (n - 1, 4, width), highest power first."""
-        grid = np.linspace(start, stop, max(math.ceil((stop - start) / _STEP) + 1, 4))
+    def _cubics(self, names: Sequence[str]) -> list[tuple[np.ndarray, np.ndarray]]:
+        """For each rotation arc, uniform knots (n) and cubic coefficients (n - 1, 4, width), highest power first."""
+        grids = [np.linspace(a, b, max(math.ceil((b - a) / _STEP) + 1, 4)) for a, b in self.spans]
         if not names:
-            return grid, np.zeros((len(grid) - 1, 4, 0))
-        table = self.fields(names, grid)
-        columns = [np.unwrap(table[n], axis=0) if n == "orbit_phase" else table[n] for n in names]
-        spline = CubicSpline(grid, np.concatenate(columns, axis=1))
-        return grid, np.ascontiguousarray(np.swapaxes(spline.c, 0, 1))
+            return [(grid, np.zeros((len(grid) - 1, 4, 0))) for grid in grids]
+        table = self.fields(names, np.concatenate(grids))  # all arcs in one call: the field's model is slow to start
+        if "orbit_phase" in names:
+            table["orbit_phase"] = np.unwrap(table["orbit_phase"], axis=0)
+        values = np.split(np.concatenate([table[n] for n in names], axis=1), np.cumsum([len(g) for g in grids])[:-1])
+        return [(grid, np.ascontiguousarray(np.swapaxes(CubicSpline(grid, value).c, 0, 1)))
+                for grid, value in zip(grids, values, strict=True)]
 
 
 class _PiecewiseCubic:

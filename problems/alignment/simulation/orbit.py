@@ -137,6 +137,13 @@ class Orbit:
         x, y, z = vector.T
         return np.stack([c * x + s * y, c * y - s * x, z], axis=1)
 
+    def from_earth_fixed(self, time: np.ndarray, vector: np.ndarray) -> np.ndarray:
+        """Inertial coordinates (n, 3) of Earth-fixed vectors (n, 3)."""
+        angle = self.earth_angle(time)
+        c, s = np.cos(angle), np.sin(angle)
+        x, y, z = vector.T
+        return np.stack([c * x - s * y, c * y + s * x, z], axis=1)
+
     def relative_velocity(self, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
         """Velocity against the rotating Earth (n, 3) m/s, coordinates in inertial axes."""
         rate = self.earth_rotation_rate
