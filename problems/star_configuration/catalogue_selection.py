@@ -555,7 +555,8 @@ def _search(problem: _Problem, answer: Any, exact: bool, node_limit: int) -> Sel
         nodes += 1
         pending = True
         while pending:
-            free = everything[~inside & ~outside]
+            full = np.bincount(problem.camera[inside], minlength=len(problem.quotas)) >= problem.quotas
+            free = everything[~inside & ~outside & ~full[problem.camera]]
             part = _part(problem, inside, free)
             if part is None:
                 break
