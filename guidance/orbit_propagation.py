@@ -155,6 +155,11 @@ def state_from_elements(semi_major_axis: float, eccentricity: float, inclination
     return radius * radial, velocity
 
 
+def chebyshev_values(x: Array, count: int) -> Array:
+    """The first ``count`` Chebyshev polynomials (..., count) at points brought into [-1, 1]."""
+    return np.cos(np.arccos(np.clip(x, -1.0, 1.0))[..., None] * np.arange(count))
+
+
 class Arc:
     """A piece of the orbit as Chebyshev polynomials, with the Earth's orientation along it.
 
@@ -166,18 +171,16 @@ class Arc:
 
     def __init__(self, start: float, stop: float, coefficients: Array, earth: EarthOrientation):
         self.start, self.stop, self.earth = start, stop, earth
-        self._position = coefficients
         half = 0.5 * (stop - start)
-        self._velocity = chebyshev.chebder(coefficients) / half
-
-    def _argument(self, times: ArrayLike) -> Array:
-        return (2 * np.asarray(times, float) - self.start - self.stop) / (self.stop - self.start)
+        velocity = np.zeros_like(coefficients)
+        velocity[:-1] = chebyshev.chebder(coefficients) / half
+        self._state = np.concatenate([coefficients, velocity], 1)
 
     def inertial(self, times: ArrayLike) -> tuple[Array, Array]:
-        """Positions (..., 3, m) and velocities (..., 3, m/s) in GCRF axes."""
-        x = self._argument(times)
-        return (np.moveaxis(chebyshev.chebval(x, self._position), 0, -1),
-                np.moveaxis(chebyshev.chebval(x, self._velocity), 0, -1))
+        """Positions (..., 3, m) and velocities (..., 3, m/s) in GCRF axes; at the nearer end outside the arc."""
+        x = (2 * np.asarray(times, float) - self.start - self.stop) / (self.stop - self.start)
+        state = chebyshev_values(x, len(self._state)) @ self._state
+        return state[..., :3], state[..., 3:]
 
     def earth_fixed(self, times: ArrayLike) -> tuple[Array, Array, Array]:
         """Positions (m), velocities relative to the Earth (m/s), both (..., 3) in ITRF axes, and ITRF from GCRF."""

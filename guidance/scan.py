@@ -27,6 +27,7 @@ here from the motion of a ground point in the camera axes.
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -52,7 +53,7 @@ from guidance.kinematics import (
     rodrigues_from_quaternion,
     sign_continuous,
 )
-from guidance.orbit_propagation import Arc
+from guidance.orbit_propagation import Arc, chebyshev_values
 from guidance.survey_request import CameraRequest
 from guidance.vector_spline import VectorSpline
 
@@ -77,18 +78,27 @@ class Camera:
         self.half_field = math.tan(request.field / 2)
 
 
+@functools.lru_cache(maxsize=256)
+def _tables(degree: int) -> tuple[Array, Array, Array, Array]:
+    """Chebyshev points in [-1, 1], the matrix from values there to coefficients, the matrix from values to integrals
+    from -1 to every point, and the weights of the whole integral."""
+    index = np.arange(degree + 1)
+    points = np.cos(np.pi * (index[::-1] + 0.5) / (degree + 1))
+    weights = np.full(degree + 1, 2.0 / (degree + 1))
+    weights[0] = 1.0 / (degree + 1)
+    analysis = weights[:, None] * chebyshev.chebvander(points, degree).T
+    antiderivative = chebyshev.chebint(analysis, lbnd=-1)
+    return (points, analysis, chebyshev.chebvander(points, degree + 1) @ antiderivative, antiderivative.sum(axis=0))
+
+
 class _Polynomial:
     """Chebyshev polynomials on an interval, through values at the interval's Chebyshev points."""
 
     def __init__(self, low: float, high: float, degree: int):
         self.low, self.high, self.degree = low, high, degree
-        index = np.arange(degree + 1)
-        self.unit = np.cos(np.pi * (index[::-1] + 0.5) / (degree + 1))
-        self.nodes = 0.5 * (low + high) + 0.5 * (high - low) * self.unit
-        vandermonde = chebyshev.chebvander(self.unit, degree)
-        weights = np.full(degree + 1, 2.0 / (degree + 1))
-        weights[0] = 1.0 / (degree + 1)
-        self.analysis = weights[:, None] * vandermonde.T
+        self.unit, self.analysis, self._integral, self._whole = _tables(degree)
+        self.half = 0.5 * (high - low)
+        self.nodes = 0.5 * (low + high) + self.half * self.unit
 
     def fit(self, values: Array) -> Array:
         """Coefficients (degree + 1, ...) of the values at the nodes."""
@@ -97,20 +107,17 @@ class _Polynomial:
     def value(self, coefficients: Array, at: ArrayLike, order: int = 0) -> Array:
         """Value or derivative at points of the interval; components of the coefficients come last."""
         if order:
-            coefficients = chebyshev.chebder(coefficients, order) / (0.5 * (self.high - self.low)) ** order
-        x = (2 * np.asarray(at, float) - self.low - self.high) / (self.high - self.low)
-        result = chebyshev.chebval(x, coefficients)
-        return np.moveaxis(result, range(coefficients.ndim - 1), range(-coefficients.ndim + 1, 0))
+            coefficients = chebyshev.chebder(coefficients, order) / self.half**order
+        x = (2 * np.asarray(at, float) - self.low - self.high) / (2 * self.half)
+        return chebyshev_values(x, len(coefficients)) @ coefficients
 
     def integral(self, values: Array) -> Array:
         """Integral from the low end to every node of a function given at the nodes."""
-        antiderivative = chebyshev.chebint(self.fit(values), lbnd=-1) * (0.5 * (self.high - self.low))
-        return chebyshev.chebval(self.unit, antiderivative)
+        return self.half * (self._integral @ values)
 
     def whole(self, values: Array) -> float:
         """Integral over the interval of a function given at the nodes."""
-        return float(chebyshev.chebval(1.0, chebyshev.chebint(self.fit(values), lbnd=-1))
-                     * 0.5 * (self.high - self.low))
+        return float(self.half * (self._whole @ values))
 
 
 @dataclass(frozen=True)
@@ -395,8 +402,7 @@ def _equalising_turn(arc: Arc, camera: Camera, ways: _Polynomial, coefficients: 
     """
     clock = _Polynomial(start, stop, ways.degree)
     way = _way_at(ways, coefficients, clock.nodes)
-    point = np.stack([chebyshev.chebval((2 * way - ways.low - ways.high) / (ways.high - ways.low), column)
-                      for column in np.concatenate([ways.fit(ground), ways.fit(tangent)], -1).T], -1)
+    point = ways.value(ways.fit(np.concatenate([ground, tangent], -1)), way)
     position, velocity, _ = arc.earth_fixed(clock.nodes)
     sight, along = _camera_axes(point[:, :3] - position, point[:, 3:])
     if turned:

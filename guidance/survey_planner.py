@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 from estimator.models.errors import BoresightError, GeometryError, InfeasibleError
 from guidance.coverage import Outline, outline, overlaps
 from guidance.ground_geometry import EquidistantPlane, GroundLine, geodesic_inverse, wrapped
+from guidance.kinematics import Motion
 from guidance.orbit_propagation import Arc, Pass
 from guidance.scan import Camera, Scan, make_scan, pitch_of
 from guidance.slew_joining import Join, Joiner, end_of
@@ -36,6 +38,7 @@ AZIMUTH_LIMIT = math.pi / 9  # rad, of the scans from the ground track (Somov et
 OVERLAP_GUARD = 2e-4  # added to the asked overlap
 END_GUARD = 60.0  # m, by which a detector line passes the end of the area
 MOST_SCANS = 40  # in one pass
+PITCH_RATE = 0.008  # rad/s, rough rate at which the pitch of a ground point falls: scales the centring step only
 
 
 @dataclass(frozen=True)
@@ -198,7 +201,7 @@ class PassPlanner:
         scans: list[Scan] = []
         shapes: list[Outline] = []
         complete = False
-        for round_ in range(rounds):
+        for _ in range(rounds):
             ordered = strips if pattern.from_left else strips[::-1]
             scans, clock, worst_gap = [], begin, 0.0
             for index, (strip, forward) in enumerate(zip(ordered, pattern.forward, strict=True)):
@@ -213,31 +216,31 @@ class PassPlanner:
                     worst_gap = max(worst_gap, abs(wanted - gaps[index - 1]))
                     gaps[index - 1] = wanted
                 scans.append(scan)
-            in_place = scans if pattern.from_left else scans[::-1]
-            shapes = [outline(s, self.plane) for s in in_place]
+            shapes = [outline(s, self.plane) for s in (scans if pattern.from_left else scans[::-1])]
+            placed = tuple(replace(s) for s in strips)
             change, complete = self._move(strips, shapes, fill)
-            pitch = self._pitches(scans)
-            lag = float(np.clip((pitch.max() + pitch.min()) / (2 * 0.008), -40, 40)) - self._shift_done(shift)
-            begin += lag
-            if change < tolerance and abs(lag) < (0.3 if coarse else 0.02) and worst_gap < (0.05 if coarse else 1e-3):
+            lag = self._lag(scans, shift)
+            if change < tolerance and abs(lag) < (0.3 if coarse else 0.05) and worst_gap < (0.1 if coarse else 5e-3):
                 break
-            del round_
+            begin += lag
+        else:
+            if change > 2000.0:
+                raise GeometryError("the scans of the area do not settle", where="survey planner",
+                                    value=f"{change:.0f} m from round to round")
         off_nadir = max(s.largest_off_nadir() for s in scans)
-        return AreaPlan(pattern, tuple(scans), (), tuple(shapes), tuple(replace(s) for s in strips), complete,
-                        off_nadir, self._excess(scans, off_nadir))
+        return AreaPlan(pattern, tuple(scans), (), tuple(shapes), placed, complete, off_nadir,
+                        excess_of_scans(scans, self.limits, off_nadir))
 
-    def _shift_done(self, shift: float) -> float:
-        return -shift
+    def _lag(self, scans: list[Scan] | tuple[Scan, ...], shift: float) -> float:
+        """Seconds by which the scans are to be later, for equal pitches forward and backward ``shift`` s ago."""
+        times = np.array([t for s in scans for t in (s.start, s.stop)])
+        points = np.concatenate([s.line.at(np.array([s.first, s.last]))[0] for s in scans])
+        pitch = pitch_of(self.arc, times - shift, points)
+        return float(np.clip((pitch.max() + pitch.min()) / (2 * PITCH_RATE), -40, 40))
 
     def _first_gap(self) -> float:
         limits = self.limits
         return 2 * math.sqrt(math.radians(6.0) / limits.acceleration) + limits.acceleration / limits.jerk
-
-    def _pitches(self, scans: list[Scan]) -> Array:
-        """Pitch (rad) of the line of sight at the starts and stops of the scans."""
-        times = np.array([t for s in scans for t in (s.start, s.stop)])
-        points = np.concatenate([s.line.at(np.array([s.first, s.last]))[0] for s in scans])
-        return pitch_of(self.arc, times, points)
 
     def _move(self, strips: list[Strip], shapes: list[Outline], fill: bool) -> tuple[float, bool]:
         """Move the strips towards the asked overlap and ends; the largest move (m) and whether the area is covered."""
@@ -273,12 +276,7 @@ class PassPlanner:
             gaps = [min(room, most)] * (count - 1)
         # Spare length left beside the neighbours goes to the area's two edges.
         rest = total - sum(gaps)
-        if self.left is None:
-            move = left_spare - (rest / 2 if complete or fill else 0.0)
-        else:
-            move = left_spare - (0.0 if not (complete and fill) else 0.0)
-        if not fill:
-            move = left_spare
+        move = left_spare - (rest / 2 if self.left is None and fill else 0.0)
         moves = []
         for index in range(count):
             moves.append(move)
@@ -294,15 +292,7 @@ class PassPlanner:
             largest = max(largest, abs(step), abs(near), abs(far))
         return largest, complete
 
-    def _excess(self, scans: list[Scan], off_nadir: float) -> dict[str, tuple[float, float]]:
-        return excess_of_scans(scans, self.limits, off_nadir)
-
     # ------------------------------------------------------------------------------------------------- the search
-
-    def count_of_scans(self, width: float) -> ScanCount:
-        """The paper's estimate, printed and corrected, for a width (m) to cover, from rough swaths."""
-        nadir = self.swath(0.0, self.closest)
-        return counts(width, nadir, nadir * 1.2, self.area.overlap)
 
     def guess(self, count: int, fill: bool) -> list[Strip]:
         """Strips to begin with."""
@@ -316,70 +306,91 @@ class PassPlanner:
             first = edge + swath * (0.5 - area.overlap)
         return [Strip(first + i * spacing, -area.length / 2 - 500, area.length / 2 + 500) for i in range(count)]
 
-    def patterns(self, count: int, wide: bool) -> list[Pattern]:
-        """Orders and directions to try."""
+    def patterns(self, count: int) -> list[Pattern]:
+        """Orders and directions to try: to and fro, or all forward; from either side."""
         alternating = [tuple((i % 2 == 0) == first for i in range(count)) for first in (True, False)]
-        directions = list(dict.fromkeys([*alternating, (True,) * count] if wide else alternating))
+        directions = list(dict.fromkeys([*alternating, (True,) * count]))
         sides = (True, False) if count > 1 else (True,)
         return [Pattern(side, d) for d, side in itertools.product(directions, sides)]
 
     def best(self, count: int, *, fill: bool, shift: float = 0.0) -> AreaPlan:
         """The quickest feasible plan with a number of scans; the least infeasible one where none is feasible.
 
+        All patterns are looked at roughly; the promising ones are followed until none of the rest can be quicker.
+
         Raises:
             InfeasibleError, GeometryError: no pattern could be simulated at all.
         """
-        plans: list[AreaPlan] = []
+        rough: list[AreaPlan] = []
         failure: BoresightError | None = None
-        for pattern in self.patterns(count, wide=True):
-            guess = min(plans, key=lambda p: p.duration).strips if plans else None
-            strips = [replace(s) for s in guess] if guess else self.guess(count, fill)
+        for pattern in self.patterns(count):
+            strips = [replace(s) for s in rough[0].strips] if rough else self.guess(count, fill)
             try:
-                plans.append(self.simulate(pattern, strips, fill=fill, shift=shift))
+                rough.append(self.simulate(pattern, strips, fill=fill, shift=shift, rounds=3 if rough else 20))
+            except (InfeasibleError, GeometryError) as error:
+                failure = error
+        if not rough:
+            assert failure is not None
+            raise failure
+        plans: list[AreaPlan] = []
+        for plan in sorted(rough, key=lambda p: p.stop):
+            feasible = [p.stop for p in plans if p.feasible]
+            if feasible and min(feasible) < plan.stop - 0.5:
+                break
+            gaps = [b.start - a.stop for a, b in itertools.pairwise(plan.scans)]
+            try:
+                plans.append(self.simulate(plan.pattern, [replace(s) for s in plan.strips], start=plan.start,
+                                           durations=gaps, fill=fill, shift=shift))
             except (InfeasibleError, GeometryError) as error:
                 failure = error
         if not plans:
             assert failure is not None
             raise failure
-        feasible = [p for p in plans if p.feasible]
-        if feasible:
-            return min(feasible, key=lambda p: p.stop)
+        feasible_plans = [p for p in plans if p.feasible]
+        if feasible_plans:
+            return min(feasible_plans, key=lambda p: p.stop)
         return min(plans, key=lambda p: max(value / limit for value, limit in p.excess.values()))
 
     def finish(self, plan: AreaPlan, *, fill: bool, shift: float = 0.0) -> AreaPlan:
-        """The plan with converged strips and with its real slews between the scans."""
-        strips = [replace(s) for s in plan.strips]
+        """The plan with converged strips and with its real slews between the scans.
+
+        Raises:
+            InfeasibleError: no slew under the limits joins two of the scans.
+        """
         gaps = [b.start - a.stop for a, b in itertools.pairwise(plan.scans)]
-        fine = self.simulate(plan.pattern, strips, start=plan.start, durations=gaps, coarse=False, fill=fill, shift=shift)
-        ratio = [1.0] * len(gaps)
-        begin, joins = fine.start, tuple[Join, ...]()
-        for _ in range(4):
-            scans, joins = self._with_slews(fine.pattern, strips, begin)
+        fine = self.simulate(plan.pattern, [replace(s) for s in plan.strips], start=plan.start, durations=gaps,
+                             coarse=False, fill=fill, shift=shift)
+        strips = [replace(s) for s in fine.strips]
+        begin = fine.start
+        guesses: list[float | None] = [b.start - a.stop for a, b in itertools.pairwise(fine.scans)]
+        for _ in range(8):
+            placed = tuple(replace(s) for s in strips)
+            scans, joins = self._with_slews(fine.pattern, strips, begin, guesses, 0.02)
+            guesses = [j.duration for j in joins]
             shapes = [outline(s, self.plane) for s in (scans if fine.pattern.from_left else scans[::-1])]
-            before = [replace(s) for s in strips]
             change, complete = self._move(strips, shapes, fill)
-            pitch = self._pitches(list(scans))
-            lag = float(np.clip((pitch.max() + pitch.min()) / (2 * 0.008), -40, 40)) + shift
-            if change < 20.0 and abs(lag) < 0.1:
-                strips = before
+            lag = self._lag(scans, shift)
+            if change < 10.0 and abs(lag) < 0.1:
                 break
             begin += lag
-        else:
-            scans, joins = self._with_slews(fine.pattern, strips, begin)
-            shapes = [outline(s, self.plane) for s in (scans if fine.pattern.from_left else scans[::-1])]
-        del ratio
+        scans, joins = self._with_slews(fine.pattern, list(placed), begin, guesses, 1e-6)
+        shapes = [outline(s, self.plane) for s in (scans if fine.pattern.from_left else scans[::-1])]
         off_nadir = max(s.largest_off_nadir() for s in scans)
-        return AreaPlan(fine.pattern, scans, joins, tuple(shapes), tuple(strips), complete, off_nadir,
-                        self._excess(list(scans), off_nadir))
+        return AreaPlan(fine.pattern, scans, joins, tuple(shapes), placed, complete, off_nadir,
+                        excess_of_scans(scans, self.limits, off_nadir))
 
-    def _with_slews(self, pattern: Pattern, strips: list[Strip], begin: float) -> tuple[tuple[Scan, ...], tuple[Join, ...]]:
+    def _with_slews(self, pattern: Pattern, strips: list[Strip], begin: float, guesses: list[float | None],
+                    tolerance: float) -> tuple[tuple[Scan, ...], tuple[Join, ...]]:
         """Scans begun as soon as the slew from the one before allows, with those slews."""
         ordered = strips if pattern.from_left else strips[::-1]
         scans = [self.scan(ordered[0], begin, pattern.forward[0])]
         joins: list[Join] = []
-        for strip, forward in zip(ordered[1:], pattern.forward[1:], strict=True):
-            join, scan = soonest(self.joiner, scans[-1],
-                                 lambda t, strip=strip, forward=forward: self.scan(strip, t, forward))  # type: ignore[misc]
+        for strip, forward, guess in zip(ordered[1:], pattern.forward[1:], guesses, strict=True):
+
+            def make(start: float, strip: Strip = strip, forward: bool = forward) -> Scan:
+                return self.scan(strip, start, forward)
+
+            join, scan = soonest(self.joiner, scans[-1], make, guess=guess, tolerance=tolerance)
             joins.append(join)
             scans.append(scan)
         return tuple(scans), tuple(joins)
@@ -416,19 +427,20 @@ def excess_of_scans(scans: list[Scan], limits: LimitsRequest, off_nadir: float) 
     return found
 
 
-def soonest(joiner: Joiner, before: Scan, make: object, *, guess: float | None = None) -> tuple[Join, Scan]:
+def soonest(joiner: Joiner, before: Scan, make: Callable[[float], Scan], *, guess: float | None = None,
+            tolerance: float = 1e-6) -> tuple[Join, Scan]:
     """The slew and the scan after it, begun as soon as the slew allows.
 
     The attitude at which the scan starts moves with its time, so that the slew's time depends on itself: secant steps
-    on the gap less the slew's time, down to a microsecond.
+    on the gap less the slew's time.
 
     Args:
         joiner: makes slews.
         before: the scan that the slew leaves.
         make: the scan of a given start (s from the epoch).
         guess: gap to begin with, s.
+        tolerance: s; a microsecond or less for a plan to be flown.
     """
-    assert callable(make)
     end = end_of(before.motion([before.stop]))
     gap = guess
     if gap is None:
@@ -443,7 +455,7 @@ def soonest(joiner: Joiner, before: Scan, make: object, *, guess: float | None =
         scan = make(before.stop + gap)
         join = joiner.join(end, end_of(scan.motion([scan.start])), before.stop)
         miss = join.duration - gap
-        if abs(miss) < 1e-6:
+        if abs(miss) < tolerance:
             return _stretched(join, gap), scan
         history.append((gap, miss))
         if len(history) > 1 and history[-1][1] != history[-2][1]:
@@ -457,24 +469,21 @@ def soonest(joiner: Joiner, before: Scan, make: object, *, guess: float | None =
 
 
 def _stretched(join: Join, gap: float) -> Join:
-    """The slew over a time that differs from its own by less than a microsecond."""
+    """The slew over a time that differs from its own a little."""
     ratio = join.duration / gap
     law = join.at
 
-    def at(times: Array) -> object:
+    def at(times: Array) -> Motion:
         motion = law(np.asarray(times) * ratio)
         return replace(motion, rate=motion.rate * ratio, acceleration=motion.acceleration * ratio**2,
                        jerk=motion.jerk * ratio**3)
 
-    return replace(join, duration=gap, at=at)  # type: ignore[arg-type]
+    return replace(join, duration=gap, at=at)
 
 
-def _settled(joiner: Joiner, end: object, before: Scan, make: object, history: list[tuple[float, float]],
-             ) -> tuple[Join, Scan]:
+def _settled(joiner: Joiner, end: Motion, before: Scan, make: Callable[[float], Scan],
+             history: list[tuple[float, float]]) -> tuple[Join, Scan]:
     """A slew of given time, where the least time jumps and the secant steps find no fixed point."""
-    from guidance.kinematics import Motion
-
-    assert callable(make) and isinstance(end, Motion)
     gap = max(g + m for g, m in history[-5:])
     for _ in range(40):
         scan = make(before.stop + gap)
