@@ -43,14 +43,16 @@ def tai_from_utc(texts: Iterable[str]) -> np.ndarray:
     Raises:
         FileFormatError: a text is no date and time.
     """
-    import erfa
+    import erfa  # type: ignore[import-untyped]
 
     whole, seconds, offsets = [], [], []
     known: dict[tuple[int, int, int], float] = {}
     for text in texts:
         found = _UTC.fullmatch(text.strip())
         if found is None:
-            raise FileFormatError("this is no UTC date and time", value=repr(text), limit="such as 2021-06-04T08:22:13.5")
+            raise FileFormatError(
+                "this is no UTC date and time", value=repr(text), limit="such as 2021-06-04T08:22:13.5"
+            )
         year, month, day, hour, minute = (int(found[i]) for i in range(1, 6))
         try:
             date = np.datetime64(f"{year:04d}-{month:02d}-{day:02d}T{hour:02d}:{minute:02d}", "us")
@@ -96,9 +98,12 @@ def _bulletin() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     year, month, day, _ = erfa.jd2cal(2400000.5, date)
     offset = erfa.dat(year, month, day, 0.0)
     arc_second = np.pi / 180 / 3600  # [rad]
-    return (date, np.asarray(table["UT1_UTC"].value, dtype=float)[known] - offset,
-            np.asarray(table["PM_x"].value, dtype=float)[known] * arc_second,
-            np.asarray(table["PM_y"].value, dtype=float)[known] * arc_second)
+    return (
+        date,
+        np.asarray(table["UT1_UTC"].value, dtype=float)[known] - offset,
+        np.asarray(table["PM_x"].value, dtype=float)[known] * arc_second,
+        np.asarray(table["PM_y"].value, dtype=float)[known] * arc_second,
+    )
 
 
 def _orientation(tai: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -110,8 +115,12 @@ def _orientation(tai: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     when = (one - 2400000.5) + two
     if when.size and (when.min() < date[0] or when.max() > date[-1] + _HELD):
         worst = when.min() if when.min() < date[0] else when.max()
-        raise InputError("the Earth's orientation is not known for this date", value=f"modified Julian date {worst:.1f}",
-                         limit=f"{date[0]:.0f} to {date[-1] + _HELD:.0f}", remedy="update the package astropy-iers-data")
+        raise InputError(
+            "the Earth's orientation is not known for this date",
+            value=f"modified Julian date {worst:.1f}",
+            limit=f"{date[0]:.0f} to {date[-1] + _HELD:.0f}",
+            remedy="update the package astropy-iers-data",
+        )
     return np.interp(when, date, offset), np.interp(when, date, x), np.interp(when, date, y)
 
 

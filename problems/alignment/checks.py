@@ -1,4 +1,4 @@
-"""What a campaign must satisfy before it is used: each defect has its own typed error, each harmless oddity is put right.
+"""What a campaign must satisfy before it is used: each defect has its own typed error, each oddity is put right.
 
 Accepted, and put right where needed:
 
@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from datetime import datetime
+from itertools import pairwise
 
 import numpy as np
 
@@ -122,7 +123,11 @@ def _bracketed(samples: np.ndarray, times: np.ndarray, longest_gap: float | None
 
 
 def _median_step(times: np.ndarray) -> float:
-    return float(np.median(np.diff(times))) if times.size > 1 else 0.0
+    """Median interval between neighbours; of a long series, of 2000 intervals spread over it."""
+    if times.size < 2:
+        return 0.0
+    first = np.arange(times.size - 1) if times.size < 2000 else np.linspace(0, times.size - 2, 2000).astype(int)
+    return float(np.median(times[first + 1] - times[first]))
 
 
 # ---------------------------------------------------------------------------------------------------------------- #
@@ -142,17 +147,26 @@ def _check_finite(values: np.ndarray, where: str) -> None:
     if bad.any():
         first = tuple(int(i) for i in np.argwhere(bad)[0])
         index = ", ".join(map(str, first))
-        raise NotFiniteError("a value is NaN or infinite" if bad.sum() == 1 else f"{int(bad.sum())} values are NaN or infinite",
-                             where=f"{where}[{index}]", value=float(values[first]), limit="finite",
-                             remedy="leave the sample out; gaps are accepted")
+        raise NotFiniteError(
+            "a value is NaN or infinite" if bad.sum() == 1 else f"{int(bad.sum())} values are NaN or infinite",
+            where=f"{where}[{index}]",
+            value=float(values[first]),
+            limit="finite",
+            remedy="leave the sample out; gaps are accepted",
+        )
 
 
 def _check_times(times: np.ndarray, where: str, *, fewest: int) -> None:
     if times.ndim != 1:
         raise ShapeError("the times must have one dimension", where=where, value=times.shape)
     if times.size < fewest:
-        raise TooFewDataError("there are too few samples", where=where, value=times.size, limit=f"at least {fewest}",
-                              remedy="use a longer stretch of data")
+        raise TooFewDataError(
+            "there are too few samples",
+            where=where,
+            value=times.size,
+            limit=f"at least {fewest}",
+            remedy="use a longer stretch of data",
+        )
     _check_finite(times, where)
     steps = np.diff(times)
     wrong = np.flatnonzero(steps <= 0)
@@ -161,10 +175,14 @@ def _check_times(times: np.ndarray, where: str, *, fewest: int) -> None:
         repeated = steps[k] == 0
         what = "a time is duplicated" if repeated else "the times go backwards"
         more = f" ({wrong.size} places)" if wrong.size > 1 else ""
-        remedy = ("keep one row for each time" if repeated
-                  else "sort the rows by time, each row together with its time")
-        raise TimeOrderError(what + more, where=f"{where}[{k + 1}]", value=f"{times[k + 1]:.6f} s after {times[k]:.6f} s",
-                             limit="strictly increasing", remedy=remedy)
+        remedy = "keep one row for each time" if repeated else "sort the rows by time, each row together with its time"
+        raise TimeOrderError(
+            what + more,
+            where=f"{where}[{k + 1}]",
+            value=f"{times[k + 1]:.6f} s after {times[k]:.6f} s",
+            limit="strictly increasing",
+            remedy=remedy,
+        )
 
 
 def _check_positive(deviation: np.ndarray, shape: tuple[int, ...], where: str) -> None:
@@ -173,22 +191,30 @@ def _check_positive(deviation: np.ndarray, shape: tuple[int, ...], where: str) -
     one = deviation[:1] if deviation.shape[0] > 0 and deviation.strides[0] == 0 else deviation
     if one.size and not (one > 0).all():
         first = tuple(int(i) for i in np.argwhere(one <= 0)[0])
-        raise UnitError("a standard deviation is not positive", where=f"{where}[{', '.join(map(str, first))}]",
-                        value=float(one[first]), limit="> 0", remedy="state the accuracy of the sensor")
+        raise UnitError(
+            "a standard deviation is not positive",
+            where=f"{where}[{', '.join(map(str, first))}]",
+            value=float(one[first]),
+            limit="> 0",
+            remedy="state the accuracy of the sensor",
+        )
 
 
 def _unit(vectors: np.ndarray, where: str, what: str, error: type[InputError]) -> np.ndarray:
     """The vectors along the last axis with length 1, or an error where they are not nearly so."""
-    lengths = np.sqrt(np.einsum("...i,...i->...", vectors, vectors))
+    lengths = np.sqrt(np.sum(vectors * vectors, axis=-1))
     deviation = np.abs(lengths - 1)
     if deviation.size and deviation.max() > QUATERNION_LIMIT:
         first = np.unravel_index(int(np.argmax(deviation > QUATERNION_LIMIT)), deviation.shape)
         count = int((deviation > QUATERNION_LIMIT).sum())
         index = f"[{', '.join(str(int(i)) for i in first)}]" if first else ""
-        raise error(f"{what} is not of unit length" + (f" ({count} of {deviation.size})" if count > 1 else ""),
-                    where=where + index, value=f"length {float(lengths[first]):.9g}",
-                    limit=f"1 within {QUATERNION_LIMIT:g}",
-                    remedy="check the components and their storage; do not normalize corrupted values")
+        raise error(
+            f"{what} is not of unit length" + (f" ({count} of {deviation.size})" if count > 1 else ""),
+            where=where + index,
+            value=f"length {float(lengths[first]):.9g}",
+            limit=f"1 within {QUATERNION_LIMIT:g}",
+            remedy="check the components and their storage; do not normalize corrupted values",
+        )
     if deviation.size and deviation.max() > _EXACT:
         return vectors / lengths[..., None]
     return vectors
@@ -213,8 +239,12 @@ def _check_epoch(campaign: Campaign) -> None:
     try:
         datetime.fromisoformat(campaign.epoch.strip().replace("Z", "+00:00"))
     except ValueError as error:
-        raise InputError("the epoch is not a date and time in ISO 8601", where="epoch", value=repr(campaign.epoch),
-                         limit="such as 2024-03-01T00:00:00Z") from error
+        raise InputError(
+            "the epoch is not a date and time in ISO 8601",
+            where="epoch",
+            value=repr(campaign.epoch),
+            limit="such as 2024-03-01T00:00:00Z",
+        ) from error
 
 
 def _check_earth(campaign: Campaign) -> None:
@@ -224,8 +254,13 @@ def _check_earth(campaign: Campaign) -> None:
     angle = campaign.earth_rotation_angle_at_epoch
     if abs(angle) > 2 * np.pi * (1 + 1e-9):
         looks = "; it looks like degrees" if abs(angle) <= 360 else ""
-        raise UnitError(f"the angle exceeds one turn{looks}", where="earth_rotation_angle_at_epoch",
-                        value=f"{angle:.6g}", limit="2 pi rad", remedy="give it in radians, reduced to one turn")
+        raise UnitError(
+            f"the angle exceeds one turn{looks}",
+            where="earth_rotation_angle_at_epoch",
+            value=f"{angle:.6g}",
+            limit="2 pi rad",
+            remedy="give it in radians, reduced to one turn",
+        )
     rate = campaign.earth_rotation_rate
     if abs(rate - _EARTH_RATE) > 0.01 * _EARTH_RATE:
         looks = ""
@@ -233,9 +268,13 @@ def _check_earth(campaign: Campaign) -> None:
             looks = "; it looks like degrees per second"
         elif abs(rate / 86400 / _EARTH_RATE - 1) < 0.01:
             looks = "; it looks like radians per day"
-        raise UnitError(f"the rate is not that of the Earth{looks}", where="earth_rotation_rate",
-                        value=f"{rate:.6g} rad/s", limit=f"{_EARTH_RATE:g} rad/s within 1 %",
-                        remedy="give it in rad/s, positive towards the east")
+        raise UnitError(
+            f"the rate is not that of the Earth{looks}",
+            where="earth_rotation_rate",
+            value=f"{rate:.6g} rad/s",
+            limit=f"{_EARTH_RATE:g} rad/s within 1 %",
+            remedy="give it in rad/s, positive towards the east",
+        )
 
 
 def _checked_gnss(gnss: GnssSeries) -> GnssSeries:
@@ -255,9 +294,13 @@ def _checked_gnss(gnss: GnssSeries) -> GnssSeries:
             looks = "; it looks like millimetres"
         side = "below the Earth's surface" if radius[k] < low else "beyond the Moon"
         count = f" ({bad.size} of {radius.size} samples)" if bad.size > 1 else ""
-        raise UnitError(f"the position lies {side}{looks}{count}", where=f"gnss/position[{k}]",
-                        value=f"{radius[k]:.6g} m from the centre of the Earth",
-                        limit=f"{low:g} m" if radius[k] < low else f"{high:g} m", remedy="give positions in metres")
+        raise UnitError(
+            f"the position lies {side}{looks}{count}",
+            where=f"gnss/position[{k}]",
+            value=f"{radius[k]:.6g} m from the centre of the Earth",
+            limit=f"{low:g} m" if radius[k] < low else f"{high:g} m",
+            remedy="give positions in metres",
+        )
     return gnss
 
 
@@ -269,8 +312,13 @@ def _checked_tracker(tracker: TrackerSeries) -> TrackerSeries:
     _check_positive(tracker.standard_deviation, (tracker.time.size, 3), where)
     largest = float(np.median(tracker.standard_deviation.max(axis=1)))
     if largest > 0.1:
-        raise UnitError("the accuracy of the star tracker is no angle in radians; it looks like degrees or arc seconds",
-                        where=where, value=f"{largest:.6g}", limit="0.1 rad", remedy="give it in radians")
+        raise UnitError(
+            "the accuracy of the star tracker is no angle in radians; it looks like degrees or arc seconds",
+            where=where,
+            value=f"{largest:.6g}",
+            limit="0.1 rad",
+            remedy="give it in radians",
+        )
     quaternion = _continuous(_unit(tracker.quaternion, "star_tracker/quaternion", "the quaternion", QuaternionError))
     return tracker if quaternion is tracker.quaternion else replace(tracker, quaternion=quaternion)
 
@@ -278,24 +326,39 @@ def _checked_tracker(tracker: TrackerSeries) -> TrackerSeries:
 def _checked_doppler(doppler: DopplerSeries) -> DopplerSeries:
     _check_times(doppler.time, "doppler/time", fewest=1)
     if doppler.frequency_shift.ndim != 2 or doppler.frequency_shift.shape[1] < 1:
-        raise ShapeError("the array has the wrong shape", where="doppler/frequency_shift",
-                         value=doppler.frequency_shift.shape, limit="(time, beam) with at least one beam")
+        raise ShapeError(
+            "the array has the wrong shape",
+            where="doppler/frequency_shift",
+            value=doppler.frequency_shift.shape,
+            limit="(time, beam) with at least one beam",
+        )
     shape = (doppler.time.size, doppler.frequency_shift.shape[1])
     _check_shape(doppler.frequency_shift, shape, "doppler/frequency_shift")
     _check_finite(doppler.frequency_shift, "doppler/frequency_shift")
     _check_positive(doppler.standard_deviation, shape, "doppler/frequency_shift.standard_deviation")
     if doppler.frequency_shift.size < 3:
-        raise TooFewDataError("there are too few Doppler measurements for the three angles of the antenna",
-                              where="doppler/frequency_shift", value=doppler.frequency_shift.size, limit="at least 3",
-                              remedy="use a longer session")
+        raise TooFewDataError(
+            "there are too few Doppler measurements for the three angles of the antenna",
+            where="doppler/frequency_shift",
+            value=doppler.frequency_shift.size,
+            limit="at least 3",
+            remedy="use a longer session",
+        )
     if not np.isfinite(doppler.carrier_frequency):
-        raise NotFiniteError("the value is NaN or infinite", where="doppler/frequency_shift.carrier_frequency",
-                             value=doppler.carrier_frequency)
+        raise NotFiniteError(
+            "the value is NaN or infinite",
+            where="doppler/frequency_shift.carrier_frequency",
+            value=doppler.carrier_frequency,
+        )
     if not 1e7 <= doppler.carrier_frequency <= 1e12:  # [Hz]
-        looks = ("; it looks like gigahertz or megahertz" if 0.01 <= doppler.carrier_frequency < 1e7 else "")
-        raise UnitError(f"the carrier frequency is not that of a radar{looks}",
-                        where="doppler/frequency_shift.carrier_frequency", value=f"{doppler.carrier_frequency:g} Hz",
-                        limit="1e7 to 1e12 Hz", remedy="give it in hertz")
+        looks = "; it looks like gigahertz or megahertz" if 0.01 <= doppler.carrier_frequency < 1e7 else ""
+        raise UnitError(
+            f"the carrier frequency is not that of a radar{looks}",
+            where="doppler/frequency_shift.carrier_frequency",
+            value=f"{doppler.carrier_frequency:g} Hz",
+            limit="1e7 to 1e12 Hz",
+            remedy="give it in hertz",
+        )
     direction = doppler.beam_direction
     beams = shape[1]
     if direction.ndim == 3:
@@ -307,9 +370,13 @@ def _checked_doppler(doppler: DopplerSeries) -> DopplerSeries:
     if unit.ndim == 2 and beams >= 3:
         smallest = float(np.linalg.svd(unit, compute_uv=False)[-1])
         if smallest < _SINGULAR_VALUE_LIMIT:
-            raise GeometryError("the beams are coplanar: they do not see the velocity across their plane",
-                                where="doppler/beam_direction", value=f"smallest singular value {smallest:.3g}",
-                                limit=f"{_SINGULAR_VALUE_LIMIT:g}", remedy="check the directions, or add a beam outside the plane")
+            raise GeometryError(
+                "the beams are coplanar: they do not see the velocity across their plane",
+                where="doppler/beam_direction",
+                value=f"smallest singular value {smallest:.3g}",
+                limit=f"{_SINGULAR_VALUE_LIMIT:g}",
+                remedy="check the directions, or add a beam outside the plane",
+            )
     return doppler if unit is direction else replace(doppler, beam_direction=unit)
 
 
@@ -322,14 +389,22 @@ def _check_torque(torque: TorqueCommands) -> None:
     reversed_ = np.flatnonzero(torque.stop <= torque.start)
     if reversed_.size:
         k = int(reversed_[0])
-        raise ArcError("the torque segment does not end after its start", where=f"torque/stop[{k}]",
-                       value=f"start {torque.start[k]:g} s, stop {torque.stop[k]:g} s", limit="start < stop")
+        raise ArcError(
+            "the torque segment does not end after its start",
+            where=f"torque/stop[{k}]",
+            value=f"start {torque.start[k]:g} s, stop {torque.stop[k]:g} s",
+            limit="start < stop",
+        )
     order = np.argsort(torque.start, kind="stable")
-    for i, j in zip(order[:-1], order[1:], strict=True):
+    for i, j in pairwise(order):
         if torque.start[j] < torque.stop[i] - 1e-9:
-            raise ArcError("two torque segments overlap", where=f"torque/start[{int(j)}]",
-                           value=f"{torque.start[j]:g} s", limit=f"not before {torque.stop[i]:g} s, when segment {int(i)} stops",
-                           remedy="add the torques where two commands act together")
+            raise ArcError(
+                "two torque segments overlap",
+                where=f"torque/start[{int(j)}]",
+                value=f"{torque.start[j]:g} s",
+                limit=f"not before {torque.stop[i]:g} s, when segment {int(i)} stops",
+                remedy="add the torques where two commands act together",
+            )
 
 
 def _checked_nominal(nominal: Nominal) -> Nominal:
@@ -355,7 +430,7 @@ def check_inertia(inertia: np.ndarray, where: str) -> None:
 
     Raises:
         ShapeError, NotFiniteError: no finite 3 x 3 matrix.
-        InertiaError: not symmetric, not positive definite, or the largest principal moment exceeds the sum of the others.
+        InertiaError: not symmetric, not positive definite, or one principal moment exceeds the sum of the others.
         UnitError: a size that no spacecraft has.
     """
     _check_shape(inertia, (3, 3), where)
@@ -363,41 +438,75 @@ def check_inertia(inertia: np.ndarray, where: str) -> None:
     scale = float(np.abs(inertia).max())
     asymmetry = float(np.abs(inertia - inertia.T).max())
     if asymmetry > 1e-6 * scale:
-        raise InertiaError("the inertia tensor is not symmetric", where=where, value=f"{asymmetry:.6g} kg m2",
-                           limit=f"{1e-6 * scale:.3g} kg m2", remedy="check the signs of the products of inertia")
+        raise InertiaError(
+            "the inertia tensor is not symmetric",
+            where=where,
+            value=f"{asymmetry:.6g} kg m2",
+            limit=f"{1e-6 * scale:.3g} kg m2",
+            remedy="check the signs of the products of inertia",
+        )
     moments = np.linalg.eigvalsh((inertia + inertia.T) / 2)
     if moments[0] <= 1e-9 * scale:
-        raise InertiaError("the inertia tensor is not positive definite", where=where,
-                           value=f"smallest principal moment {moments[0]:.6g} kg m2", limit="> 0",
-                           remedy="check the tensor and its unit; products of inertia stand off the diagonal")
+        raise InertiaError(
+            "the inertia tensor is not positive definite",
+            where=where,
+            value=f"smallest principal moment {moments[0]:.6g} kg m2",
+            limit="> 0",
+            remedy="check the tensor and its unit; products of inertia stand off the diagonal",
+        )
     excess = moments[2] - moments[0] - moments[1]
     if excess > 1e-9 * scale:
-        raise InertiaError("no body has this inertia tensor: its largest principal moment exceeds the sum of the others",
-                           where=where, value=f"{moments[2]:.6g} kg m2", limit=f"{moments[0] + moments[1]:.6g} kg m2",
-                           remedy="check the tensor; a matrix of second moments of mass is not an inertia tensor")
+        raise InertiaError(
+            "no body has this inertia tensor: its largest principal moment exceeds the sum of the others",
+            where=where,
+            value=f"{moments[2]:.6g} kg m2",
+            limit=f"{moments[0] + moments[1]:.6g} kg m2",
+            remedy="check the tensor; a matrix of second moments of mass is not an inertia tensor",
+        )
     if not 1e-4 <= moments.sum() <= 1e9:
-        raise UnitError("the inertia tensor is not that of a spacecraft", where=where,
-                        value=f"trace {moments.sum():.3g} kg m2", limit="1e-4 to 1e9 kg m2", remedy="give it in kg m2")
+        raise UnitError(
+            "the inertia tensor is not that of a spacecraft",
+            where=where,
+            value=f"trace {moments.sum():.3g} kg m2",
+            limit="1e-4 to 1e9 kg m2",
+            remedy="give it in kg m2",
+        )
 
 
 def _check_arc_declarations(arcs: tuple[Arc, ...]) -> None:
     for k, arc in enumerate(arcs):
         where = f"arcs[{k}] ({arc.name})"
         if arc.kind not in ("doppler", "free_rotation", "torque_pulse"):
-            raise ArcError("the kind of arc is unknown", where=where, value=repr(arc.kind),
-                           limit="doppler, free_rotation or torque_pulse")
+            raise ArcError(
+                "the kind of arc is unknown",
+                where=where,
+                value=repr(arc.kind),
+                limit="doppler, free_rotation or torque_pulse",
+            )
         if not (np.isfinite(arc.start) and np.isfinite(arc.stop)):
-            raise NotFiniteError("the start or stop of the arc is NaN or infinite", where=where,
-                                 value=f"{arc.start} to {arc.stop}", limit="finite")
+            raise NotFiniteError(
+                "the start or stop of the arc is NaN or infinite",
+                where=where,
+                value=f"{arc.start} to {arc.stop}",
+                limit="finite",
+            )
         if arc.stop <= arc.start:
-            raise ArcError("the arc is reversed or empty", where=where,
-                           value=f"start {arc.start:g} s, stop {arc.stop:g} s", limit="start < stop")
+            raise ArcError(
+                "the arc is reversed or empty",
+                where=where,
+                value=f"start {arc.start:g} s, stop {arc.stop:g} s",
+                limit="start < stop",
+            )
     ordered = sorted(arcs, key=lambda arc: arc.start)
-    for before, after in zip(ordered[:-1], ordered[1:], strict=True):
+    for before, after in pairwise(ordered):
         if after.start < before.stop - 1e-9:
-            raise ArcError(f"the arcs {before.name!r} and {after.name!r} overlap", where="arcs",
-                           value=f"start {after.start:g} s", limit=f"not before {before.stop:g} s",
-                           remedy="a sample belongs to one arc; split or shorten one of them")
+            raise ArcError(
+                f"the arcs {before.name!r} and {after.name!r} overlap",
+                where="arcs",
+                value=f"start {after.start:g} s",
+                limit=f"not before {before.stop:g} s",
+                remedy="a sample belongs to one arc; split or shorten one of them",
+            )
 
 
 # ---------------------------------------------------------------------------------------------------------------- #
@@ -426,13 +535,23 @@ def _check_orbit(campaign: Campaign) -> None:
         return
     speed = float(np.median(np.linalg.norm(velocity, axis=1)))
     looks = ""
-    for factor, name in ((60.0, "minutes"), (3600.0, "hours"), (86400.0, "days"), (1e-3, "milliseconds"), (1e-6, "microseconds")):
+    for factor, name in (
+        (60.0, "minutes"),
+        (3600.0, "hours"),
+        (86400.0, "days"),
+        (1e-3, "milliseconds"),
+        (1e-6, "microseconds"),
+    ):
         if 0.7 <= ratio / factor <= 1.3 or (factor < 1 and ratio < 0.1 and factor == 1e-3):
             looks = f"; the times look like {name}"
             break
-    raise UnitError(f"positions and times are not those of an orbit{looks}", where="gnss",
-                    value=f"speed {speed:.4g} m/s at {np.median(radius):.4g} m from the centre of the Earth",
-                    limit="0.1 to 1.45 times the circular speed", remedy="give times in seconds and positions in metres")
+    raise UnitError(
+        f"positions and times are not those of an orbit{looks}",
+        where="gnss",
+        value=f"speed {speed:.4g} m/s at {np.median(radius):.4g} m from the centre of the Earth",
+        limit="0.1 to 1.45 times the circular speed",
+        remedy="give times in seconds and positions in metres",
+    )
 
 
 def _check_coverage(campaign: Campaign) -> None:
@@ -440,11 +559,17 @@ def _check_coverage(campaign: Campaign) -> None:
     tracker_time = campaign.star_tracker.time
     kinds = {arc.kind for arc in campaign.arcs}
     if "doppler" in kinds and campaign.doppler is None:
-        raise MissingDataError("there are Doppler arcs and no Doppler data: the group 'doppler' is missing",
-                               where="doppler", remedy="add the group, or take the Doppler arcs out")
+        raise MissingDataError(
+            "there are Doppler arcs and no Doppler data: the group 'doppler' is missing",
+            where="doppler",
+            remedy="add the group, or take the Doppler arcs out",
+        )
     if "torque_pulse" in kinds and campaign.torque is None:
-        raise MissingDataError("there are torque-pulse arcs and no torque commands: the group 'torque' is missing",
-                               where="torque", remedy="add the group, or take the torque-pulse arcs out")
+        raise MissingDataError(
+            "there are torque-pulse arcs and no torque commands: the group 'torque' is missing",
+            where="torque",
+            remedy="add the group, or take the torque-pulse arcs out",
+        )
     everything = [campaign.gnss.time, tracker_time] + ([] if campaign.doppler is None else [campaign.doppler.time])
     first, last = min(t[0] for t in everything), max(t[-1] for t in everything)
     for arc in campaign.arcs:
@@ -462,27 +587,44 @@ def _check_coverage(campaign: Campaign) -> None:
 def _check_arc_inside(arc: Arc, first: float, last: float) -> None:
     slack = 0.05 * (arc.stop - arc.start)
     if arc.start < first - slack or arc.stop > last + slack:
-        raise ArcError(f"the arc {arc.name!r} leaves the data", where="arcs",
-                       value=f"{arc.start:g} to {arc.stop:g} s", limit=f"data from {first:g} to {last:g} s",
-                       remedy="shorten the arc, or add the data that it needs")
+        raise ArcError(
+            f"the arc {arc.name!r} leaves the data",
+            where="arcs",
+            value=f"{arc.start:g} to {arc.stop:g} s",
+            limit=f"data from {first:g} to {last:g} s",
+            remedy="shorten the arc, or add the data that it needs",
+        )
 
 
 def _check_arc_data(arc: Arc, times: np.ndarray, where: str, *, fewest: int) -> None:
     a, b = np.searchsorted(times, [arc.start - 1e-9, arc.stop + 1e-9])
     inside = times[a:b]
     if inside.size == 0:
-        raise ArcError(f"the arc {arc.name!r} ({arc.kind}) lies where there are no samples", where=where,
-                       value=f"{arc.start:g} to {arc.stop:g} s", limit="inside the data",
-                       remedy="check the times of the arc, or take it out")
+        raise ArcError(
+            f"the arc {arc.name!r} ({arc.kind}) lies where there are no samples",
+            where=where,
+            value=f"{arc.start:g} to {arc.stop:g} s",
+            limit="inside the data",
+            remedy="check the times of the arc, or take it out",
+        )
     if inside.size < fewest:
-        raise TooFewDataError(f"the arc {arc.name!r} ({arc.kind}) has too few samples", where=where,
-                              value=inside.size, limit=f"at least {fewest}", remedy="take the arc out, or add samples")
+        raise TooFewDataError(
+            f"the arc {arc.name!r} ({arc.kind}) has too few samples",
+            where=where,
+            value=inside.size,
+            limit=f"at least {fewest}",
+            remedy="take the arc out, or add samples",
+        )
     uncovered = max(inside[0] - arc.start, arc.stop - inside[-1])
     limit = max(_UNCOVERED_FRACTION * (arc.stop - arc.start), 2 * _median_step(times))
     if uncovered > limit:
-        raise ArcError(f"the arc {arc.name!r} ({arc.kind}) leaves the data", where=where,
-                       value=f"{uncovered:g} s at one end without samples", limit=f"{limit:g} s",
-                       remedy="shorten the arc to where there are samples")
+        raise ArcError(
+            f"the arc {arc.name!r} ({arc.kind}) leaves the data",
+            where=where,
+            value=f"{uncovered:g} s at one end without samples",
+            limit=f"{limit:g} s",
+            remedy="shorten the arc to where there are samples",
+        )
 
 
 def _check_torque_inside(campaign: Campaign, torque: TorqueCommands) -> None:
@@ -490,19 +632,36 @@ def _check_torque_inside(campaign: Campaign, torque: TorqueCommands) -> None:
     for k, (start, stop) in enumerate(zip(torque.start, torque.stop, strict=True)):
         where = f"torque/start[{k}]"
         if start < times[0] - 1e-6 or stop > times[-1] + 1e-6:
-            raise ArcError("the torque segment lies outside the star tracker data", where=where,
-                           value=f"{start:g} to {stop:g} s", limit=f"{times[0]:g} to {times[-1]:g} s",
-                           remedy="check the times of the segment, or take it out")
+            raise ArcError(
+                "the torque segment lies outside the star tracker data",
+                where=where,
+                value=f"{start:g} to {stop:g} s",
+                limit=f"{times[0]:g} to {times[-1]:g} s",
+                remedy="check the times of the segment, or take it out",
+            )
         for arc in campaign.arcs:
-            if arc.kind == "free_rotation" and start < arc.stop - 1e-9 and stop > arc.start + 1e-9 and torque.command[k].any():
-                raise ArcError(f"a torque is commanded in the free-rotation arc {arc.name!r}", where=where,
-                               value=f"{start:g} to {stop:g} s", limit="no command in a free-rotation arc",
-                               remedy="declare the arc as torque_pulse, or correct the times")
+            if (
+                arc.kind == "free_rotation"
+                and start < arc.stop - 1e-9
+                and stop > arc.start + 1e-9
+                and torque.command[k].any()
+            ):
+                raise ArcError(
+                    f"a torque is commanded in the free-rotation arc {arc.name!r}",
+                    where=where,
+                    value=f"{start:g} to {stop:g} s",
+                    limit="no command in a free-rotation arc",
+                    remedy="declare the arc as torque_pulse, or correct the times",
+                )
     for arc in campaign.arcs_of_kind("torque_pulse"):
         if not any(a < arc.stop and b > arc.start for a, b in zip(torque.start, torque.stop, strict=True)):
-            raise ArcError(f"no torque is commanded in the torque-pulse arc {arc.name!r}", where="torque",
-                           value=f"{arc.start:g} to {arc.stop:g} s", limit="at least one segment",
-                           remedy="check the times of the segments, or declare the arc as free_rotation")
+            raise ArcError(
+                f"no torque is commanded in the torque-pulse arc {arc.name!r}",
+                where="torque",
+                value=f"{arc.start:g} to {arc.stop:g} s",
+                limit="at least one segment",
+                remedy="check the times of the segments, or declare the arc as free_rotation",
+            )
 
 
 def _check_doppler_covered(campaign: Campaign, doppler: DopplerSeries) -> None:
@@ -511,20 +670,31 @@ def _check_doppler_covered(campaign: Campaign, doppler: DopplerSeries) -> None:
     outside = np.flatnonzero((doppler.time < gnss[0] - margin) | (doppler.time > gnss[-1] + margin))
     if outside.size:
         k = int(outside[0])
-        raise ArcError("Doppler is measured outside the navigation data, where the velocity is unknown "
-                       f"({outside.size} of {doppler.time.size} epochs)", where=f"doppler/time[{k}]",
-                       value=f"{doppler.time[k]:g} s", limit=f"{gnss[0]:g} to {gnss[-1]:g} s",
-                       remedy="leave these epochs out, or add positions")
+        raise ArcError(
+            "Doppler is measured outside the navigation data, where the velocity is unknown "
+            f"({outside.size} of {doppler.time.size} epochs)",
+            where=f"doppler/time[{k}]",
+            value=f"{doppler.time[k]:g} s",
+            limit=f"{gnss[0]:g} to {gnss[-1]:g} s",
+            remedy="leave these epochs out, or add positions",
+        )
     known = attitude_known(campaign, doppler.time)
     if not known.any():
-        raise ArcError("no Doppler epoch lies inside the star tracker data", where="doppler/time",
-                       value=f"{doppler.time[0]:g} to {doppler.time[-1]:g} s",
-                       limit=f"{campaign.star_tracker.time[0]:g} to {campaign.star_tracker.time[-1]:g} s",
-                       remedy="check both time series")
+        raise ArcError(
+            "no Doppler epoch lies inside the star tracker data",
+            where="doppler/time",
+            value=f"{doppler.time[0]:g} to {doppler.time[-1]:g} s",
+            limit=f"{campaign.star_tracker.time[0]:g} to {campaign.star_tracker.time[-1]:g} s",
+            remedy="check both time series",
+        )
     sessions = campaign.arcs_of_kind("doppler")
     for arc in sessions:
         inside = (doppler.time >= arc.start - 1e-9) & (doppler.time <= arc.stop + 1e-9)
         if inside.any() and not known[inside].any():
-            raise ArcError(f"the Doppler arc {arc.name!r} lies outside the star tracker data", where="star_tracker/time",
-                           value=f"{arc.start:g} to {arc.stop:g} s", limit="attitude known in the arc",
-                           remedy="add attitudes, or take the arc out")
+            raise ArcError(
+                f"the Doppler arc {arc.name!r} lies outside the star tracker data",
+                where="star_tracker/time",
+                value=f"{arc.start:g} to {arc.stop:g} s",
+                limit="attitude known in the arc",
+                remedy="add attitudes, or take the arc out",
+            )

@@ -15,9 +15,14 @@ import_app = typer.Typer(help="Measurements of other origin to a campaign file."
 
 @import_app.command("sentinel1")
 def import_sentinel1_command(
-    files: Annotated[list[Path], typer.Argument(
-        metavar="FILES... OUT.nc", help="Annotation XML files and orbit files (.EOF) of one satellite, then the file to write.",
-        show_default=False)],
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILES... OUT.nc",
+            help="Annotation XML files and orbit files (.EOF) of one satellite, then the file to write.",
+            show_default=False,
+        ),
+    ],
     as_json: Annotated[bool, typer.Option("--json", help="Machine-readable answer on standard output.")] = False,
 ) -> None:
     """Sentinel-1 annotations (several sub-swaths, slices, scenes) and orbit files to a campaign file."""
@@ -31,8 +36,12 @@ def _imported(files: list[Path]) -> tuple[dict[str, Any], Any]:
 
     *sources, target = files
     if target.suffix.lower() in {".xml", ".eof"} or not sources:
-        raise RequestError("the last argument is the campaign file to write", value=str(target), limit="OUT.nc",
-                           remedy="boresight import sentinel1 FILES... OUT.nc")
+        raise RequestError(
+            "the last argument is the campaign file to write",
+            value=str(target),
+            limit="OUT.nc",
+            remedy="boresight import sentinel1 FILES... OUT.nc",
+        )
     annotations = [f for f in sources if not is_orbit_file(f)]
     with console.progress() as bar:
         bar.add_task(f"reading {len(sources)} files", total=None)
@@ -43,7 +52,7 @@ def _imported(files: list[Path]) -> tuple[dict[str, Any], Any]:
     result = {
         "status": "ok",
         "why": f"{len(campaign.arcs)} acquisition(s) with {doppler.time.size} Doppler estimates of {len(annotations)} "
-               f"annotation(s) written to {target}",
+        f"annotation(s) written to {target}",
         "file": str(target),
         "title": campaign.title,
         "epoch": campaign.epoch,

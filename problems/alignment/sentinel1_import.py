@@ -56,15 +56,17 @@ POSITION_DEVIATION = 0.1
 """Standard deviation given to orbit state vectors, m per axis: the mission's requirement for its restituted orbit."""
 
 ATTITUDE_DEVIATION = 15e-6
-"""Standard deviation given to the attitude, rad per axis: 4 Hz of Doppler, the part of the scatter along track of measured
-minus predicted Doppler that the sub-swaths of one scene have in common (2 to 8 Hz)."""
+"""Standard deviation given to the attitude, rad per axis: 4 Hz of Doppler, the part of the scatter along track of
+measured minus predicted Doppler that the sub-swaths of one scene have in common (2 to 8 Hz)."""
 
 _LONGEST_PAUSE = np.timedelta64(30, "s")  # between slices of one acquisition
 _ORBIT_MARGIN = np.timedelta64(100, "s")  # of state vectors from an orbit file, on both sides of an acquisition
 _SAME_ESTIMATE = 0.5  # [s] the same estimate in two slices or polarisations
 _SMALLEST_RMS = 1.0  # [Hz]
 _NODES = np.polynomial.legendre.leggauss(3)[0]  # on -1 to 1
-_NOMINAL_INERTIA = np.diag([9000.0, 5000.0, 9000.0])  # [kg m2] size of a 2300 kg body; nothing in the data depends on it
+_NOMINAL_INERTIA = np.diag(
+    [9000.0, 5000.0, 9000.0]
+)  # [kg m2] size of a 2300 kg body; nothing in the data depends on it
 
 
 def _seconds(times: np.ndarray, origin: np.datetime64) -> np.ndarray:
@@ -101,17 +103,21 @@ def orbit_at(orbit: StateVectors, times: np.ndarray) -> tuple[np.ndarray, np.nda
     outside = (times < orbit.time[0]) | (times > orbit.time[-1])
     if outside.any() or orbit.time.size < 2:
         when = times[outside][0] if outside.any() else times[0]
-        raise MissingDataError("the orbit does not cover this time", value=utc_text(when),
-                               limit=f"{utc_text(orbit.time[0])} to {utc_text(orbit.time[-1])}",
-                               remedy="add an orbit file of the acquisition")
+        raise MissingDataError(
+            "the orbit does not cover this time",
+            value=utc_text(when),
+            limit=f"{utc_text(orbit.time[0])} to {utc_text(orbit.time[-1])}",
+            remedy="add an orbit file of the acquisition",
+        )
     origin = orbit.time[0]
     curve = CubicHermiteSpline(_seconds(orbit.time, origin), orbit.position, orbit.velocity)
     seconds = _seconds(times, origin)
     return curve(seconds), curve(seconds, 1)
 
 
-def beam_directions(slant_time: np.ndarray, position: np.ndarray, earth_fixed_from_body: Rotation,
-                    height: np.ndarray) -> np.ndarray:
+def beam_directions(
+    slant_time: np.ndarray, position: np.ndarray, earth_fixed_from_body: Rotation, height: np.ndarray
+) -> np.ndarray:
     """Directions in the body x-z plane in which the radar sees the Earth at given slant ranges.
 
     Args:
@@ -152,8 +158,12 @@ def beam_directions(slant_time: np.ndarray, position: np.ndarray, earth_fixed_fr
     bad = ~(np.abs(miss(angle)[0]) < 1e-9)
     if bad.any():
         row, column = (int(i) for i in np.argwhere(bad)[0])
-        raise GeometryError("no point of the Earth's surface lies at this slant range", where="slantRangeTime",
-                            value=f"{distance[row, column]:.6g} m", limit=f"height {radius[row] - ground[row]:.6g} m")
+        raise GeometryError(
+            "no point of the Earth's surface lies at this slant range",
+            where="slantRangeTime",
+            value=f"{distance[row, column]:.6g} m",
+            limit=f"height {radius[row] - ground[row]:.6g} m",
+        )
     return np.stack([np.sin(angle), np.zeros_like(angle), -np.cos(angle)], axis=-1)
 
 
@@ -163,12 +173,19 @@ def scene_height(annotation: Annotation, times: np.ndarray) -> np.ndarray:
         return np.zeros(times.size)
     origin = annotation.start
     order = np.argsort(annotation.terrain_time)
-    return np.interp(_seconds(times, origin), _seconds(annotation.terrain_time[order], origin),
-                     annotation.terrain_height[order])
+    return np.interp(
+        _seconds(times, origin), _seconds(annotation.terrain_time[order], origin), annotation.terrain_height[order]
+    )
 
 
-def geometry_doppler(annotation: Annotation, times: np.ndarray, slant_time: np.ndarray, *,
-                     attitude: AttitudeVectors | None = None, orbit: StateVectors | None = None) -> np.ndarray:
+def geometry_doppler(
+    annotation: Annotation,
+    times: np.ndarray,
+    slant_time: np.ndarray,
+    *,
+    attitude: AttitudeVectors | None = None,
+    orbit: StateVectors | None = None,
+) -> np.ndarray:
     """Doppler centroid that orbit, attitude and the Earth's orientation predict for the annotated mounting.
 
     ``2 f / c * dot(beam, velocity)`` with the Earth-fixed velocity and the beam in the body x-z plane that reaches the
@@ -200,10 +217,15 @@ def slant_interval(annotation: Annotation, estimate: DopplerEstimate) -> tuple[f
     if estimate.fine_slant_time.size >= 2:
         return float(estimate.fine_slant_time.min()), float(estimate.fine_slant_time.max())
     if annotation.samples > 1 and annotation.product_type == "SLC":
-        return (annotation.slant_range_time,
-                annotation.slant_range_time + (annotation.samples - 1) / annotation.range_sampling_rate)
-    raise MissingDataError("the annotation does not say over which slant ranges its Doppler estimates hold",
-                           where=f"{annotation.path.name}: dcEstimate", remedy="use the SLC product of the scene")
+        return (
+            annotation.slant_range_time,
+            annotation.slant_range_time + (annotation.samples - 1) / annotation.range_sampling_rate,
+        )
+    raise MissingDataError(
+        "the annotation does not say over which slant ranges its Doppler estimates hold",
+        where=f"{annotation.path.name}: dcEstimate",
+        remedy="use the SLC product of the scene",
+    )
 
 
 def polynomial_value(coefficients: np.ndarray, slant_time: np.ndarray, reference: float) -> np.ndarray:
@@ -241,8 +263,12 @@ def compare_geometry(annotation: Annotation, *, points: int = 5) -> GeometryComp
     slant = np.array([np.linspace(*slant_interval(annotation, e), points) for e in estimates])
     times = np.array([e.time for e in estimates])
     annotated = np.array([polynomial_value(e.geometry, s, e.reference) for e, s in zip(estimates, slant, strict=True)])
-    measured = np.array([polynomial_value(e.measured, s, e.reference) if e.measured.size else np.full(points, np.nan)
-                         for e, s in zip(estimates, slant, strict=True)])
+    measured = np.array(
+        [
+            polynomial_value(e.measured, s, e.reference) if e.measured.size else np.full(points, np.nan)
+            for e, s in zip(estimates, slant, strict=True)
+        ]
+    )
     return GeometryComparison(geometry_doppler(annotation, times, slant), annotated, measured)
 
 
@@ -250,8 +276,9 @@ def compare_geometry(annotation: Annotation, *, points: int = 5) -> GeometryComp
 # the campaign
 
 
-def import_sentinel1(paths: Iterable[str | os.PathLike[str]],
-                     orbit_files: Iterable[str | os.PathLike[str]] = ()) -> Campaign:
+def import_sentinel1(
+    paths: Iterable[str | os.PathLike[str]], orbit_files: Iterable[str | os.PathLike[str]] = ()
+) -> Campaign:
     """One campaign from the annotations of several sub-swaths, slices or scenes of one satellite.
 
     Args:
@@ -266,7 +293,9 @@ def import_sentinel1(paths: Iterable[str | os.PathLike[str]],
         TooFewDataError: no usable Doppler estimate.
         InputError: the other subclasses, from the readers.
     """
-    annotations = sorted((read_annotation(path) for path in paths), key=lambda a: (a.start, a.swath, a.polarisation[::-1]))
+    annotations = sorted(
+        (read_annotation(path) for path in paths), key=lambda a: (a.start, a.swath, a.polarisation[::-1])
+    )
     return campaign_of(annotations, [read_orbit_file(path) for path in orbit_files])
 
 
@@ -274,26 +303,37 @@ def campaign_of(annotations: Sequence[Annotation], orbit_files: Sequence[OrbitFi
     """See :func:`import_sentinel1`; from files already read."""
     if not annotations:
         raise RequestError("there is no annotation to import", remedy="name at least one annotation XML file")
-    for what, values in (("satellites", {a.mission for a in annotations}),
-                         ("radar frequencies", {a.radar_frequency for a in annotations})):
+    for what, values in (
+        ("satellites", {a.mission for a in annotations}),
+        ("radar frequencies", {a.radar_frequency for a in annotations}),
+    ):
         if len(values) > 1:
-            raise RequestError(f"the annotations are of several {what}, each with its own antenna",
-                               value=", ".join(map(str, sorted(values))), limit="one",
-                               remedy="import each into its own campaign")
+            raise RequestError(
+                f"the annotations are of several {what}, each with its own antenna",
+                value=", ".join(map(str, sorted(values))),
+                limit="one",
+                remedy="import each into its own campaign",
+            )
     acquisitions = _acquisitions(annotations)
     used: set[int] = set()
     parts = [_acquisition_data(group, orbit_files, used) for group in acquisitions]
     parts = [part for part in parts if part.time.size]
     if not parts:
-        raise TooFewDataError("no Doppler estimate can be used (measured, trusted, with a known attitude)", value=0,
-                              limit="at least 1", where=", ".join(a.path.name for a in annotations[:3]))
+        raise TooFewDataError(
+            "no Doppler estimate can be used (measured, trusted, with a known attitude)",
+            value=0,
+            limit="at least 1",
+            where=", ".join(a.path.name for a in annotations[:3]),
+        )
     for k, file in enumerate(orbit_files):
         if k not in used:
-            raise RequestError("the orbit file covers none of the acquisitions, or is of another satellite",
-                               where=file.path.name,
-                               value=f"{file.mission}, {utc_text(file.orbit.time[0])} to {utc_text(file.orbit.time[-1])}",
-                               limit=f"{annotations[0].mission}, {utc_text(annotations[0].start)}",
-                               remedy="leave it out, or add the annotation that it belongs to")
+            raise RequestError(
+                "the orbit file covers none of the acquisitions, or is of another satellite",
+                where=file.path.name,
+                value=f"{file.mission}, {utc_text(file.orbit.time[0])} to {utc_text(file.orbit.time[-1])}",
+                limit=f"{annotations[0].mission}, {utc_text(annotations[0].start)}",
+                remedy="leave it out, or add the annotation that it belongs to",
+            )
     return checked(_assembled(annotations, parts))
 
 
@@ -381,8 +421,10 @@ def _chosen_estimates(group: list[Annotation], attitude: AttitudeVectors) -> lis
             if not (known and estimate.trusted and estimate.measured.size):
                 continue
             near = slant_interval(annotation, estimate)[0]
-            if any(abs((estimate.time - t) / np.timedelta64(1, "s")) < _SAME_ESTIMATE and abs(near - s) < 2e-5
-                   for t, s in seen):
+            if any(
+                abs((estimate.time - t) / np.timedelta64(1, "s")) < _SAME_ESTIMATE and abs(near - s) < 2e-5
+                for t, s in seen
+            ):
                 continue
             seen.append((estimate.time, near))
             found.append((annotation, estimate))
@@ -406,8 +448,11 @@ def _orbit_of(group: list[Annotation], orbit_files: Sequence[OrbitFile], used: s
         new = (more.time < orbit.time[0] - half) | (more.time > orbit.time[-1] + half)
         time = np.concatenate([orbit.time, more.time[new]])
         order = np.argsort(time)
-        orbit = StateVectors(time[order], np.concatenate([orbit.position, more.position[new]])[order],
-                             np.concatenate([orbit.velocity, more.velocity[new]])[order])
+        orbit = StateVectors(
+            time[order],
+            np.concatenate([orbit.position, more.position[new]])[order],
+            np.concatenate([orbit.velocity, more.velocity[new]])[order],
+        )
     return orbit
 
 
@@ -427,22 +472,33 @@ def _assembled(annotations: Sequence[Annotation], parts: list[_Part]) -> Campaig
     orbit_time, order = np.unique(orbit_time, return_index=True)
     position = orbit_position[order]
     doppler_time = _seconds(np.concatenate([part.time for part in parts]), epoch)
-    arcs = tuple(Arc(part.name, "doppler", float(_seconds(part.time[0], epoch)) - 0.5,
-                     float(_seconds(part.time[-1], epoch)) + 0.5) for part in parts)
+    arcs = tuple(
+        Arc(
+            part.name,
+            "doppler",
+            float(_seconds(part.time[0], epoch)) - 0.5,
+            float(_seconds(part.time[-1], epoch)) + 0.5,
+        )
+        for part in parts
+    )
     swaths = "+".join(sorted({a.swath for a in annotations}))
     dates = sorted({str(a.start.astype("datetime64[D]")) for a in annotations})
     when = dates[0] if len(dates) == 1 else f"{dates[0]} to {dates[-1]}"
     return Campaign(
         title=f"Sentinel-1 {annotations[0].mission} {swaths}, {when}, {len(parts)} acquisition"
-              f"{'s' if len(parts) > 1 else ''} (contains modified Copernicus Sentinel data)",
+        f"{'s' if len(parts) > 1 else ''} (contains modified Copernicus Sentinel data)",
         epoch=utc_text(epoch),
         earth_rotation_angle_at_epoch=angle,
         earth_rotation_rate=EARTH_ROTATION_RATE,
         gnss=GnssSeries(_seconds(orbit_time, epoch), position, np.broadcast_to(POSITION_DEVIATION, position.shape)),
         star_tracker=TrackerSeries(seconds, quaternion, np.broadcast_to(ATTITUDE_DEVIATION, (seconds.size, 3))),
-        doppler=DopplerSeries(doppler_time, np.concatenate([part.frequency for part in parts]),
-                              np.concatenate([part.deviation for part in parts]),
-                              np.concatenate([part.beams for part in parts]), annotations[0].radar_frequency),
+        doppler=DopplerSeries(
+            doppler_time,
+            np.concatenate([part.frequency for part in parts]),
+            np.concatenate([part.deviation for part in parts]),
+            np.concatenate([part.beams for part in parts]),
+            annotations[0].radar_frequency,
+        ),
         torque=None,
         arcs=arcs,
         nominal=Nominal(np.array([1.0, 0, 0, 0]), np.array([1.0, 0, 0, 0]), _NOMINAL_INERTIA),

@@ -16,6 +16,7 @@ import math
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, cast
 
@@ -40,11 +41,34 @@ from problems.alignment.checks import checked
 _DEGREE = math.pi / 180  # [rad]
 
 _FACTORS: dict[str, dict[str, float]] = {
-    "s": {"s": 1.0, "second": 1.0, "seconds": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0,
-          "minutes": 60.0, "h": 3600.0, "hours": 3600.0, "d": 86400.0, "days": 86400.0},
+    "s": {
+        "s": 1.0,
+        "second": 1.0,
+        "seconds": 1.0,
+        "sec": 1.0,
+        "ms": 1e-3,
+        "us": 1e-6,
+        "ns": 1e-9,
+        "min": 60.0,
+        "minutes": 60.0,
+        "h": 3600.0,
+        "hours": 3600.0,
+        "d": 86400.0,
+        "days": 86400.0,
+    },
     "m": {"m": 1.0, "metre": 1.0, "metres": 1.0, "meter": 1.0, "meters": 1.0, "km": 1e3, "mm": 1e-3, "cm": 1e-2},
-    "rad": {"rad": 1.0, "radian": 1.0, "radians": 1.0, "deg": _DEGREE, "degree": _DEGREE, "degrees": _DEGREE,
-            "mrad": 1e-3, "urad": 1e-6, "arcsec": _DEGREE / 3600, "arcmin": _DEGREE / 60},
+    "rad": {
+        "rad": 1.0,
+        "radian": 1.0,
+        "radians": 1.0,
+        "deg": _DEGREE,
+        "degree": _DEGREE,
+        "degrees": _DEGREE,
+        "mrad": 1e-3,
+        "urad": 1e-6,
+        "arcsec": _DEGREE / 3600,
+        "arcmin": _DEGREE / 60,
+    },
     "rad/s": {"rad/s": 1.0, "rad s-1": 1.0, "deg/s": _DEGREE, "deg s-1": _DEGREE},
     "Hz": {"Hz": 1.0, "hertz": 1.0, "kHz": 1e3, "MHz": 1e6, "GHz": 1e9, "mHz": 1e-3},
     "N m": {"N m": 1.0, "Nm": 1.0, "N*m": 1.0, "N.m": 1.0, "mN m": 1e-3, "mNm": 1e-3},
@@ -60,9 +84,20 @@ def _factor(stated: str | None, unit: str, where: str) -> float:
         return 1.0
     factor = _FACTORS[unit].get(stated.strip())
     if factor is None:
-        raise UnitError("the units attribute does not name a unit of this quantity", where=where, value=repr(stated),
-                        limit=repr(unit), remedy=f"store the values in {unit} and say so")
+        raise UnitError(
+            "the units attribute does not name a unit of this quantity",
+            where=where,
+            value=repr(stated),
+            limit=repr(unit),
+            remedy=f"store the values in {unit} and say so",
+        )
     return factor
+
+
+def _instant(text: str) -> datetime:
+    """A date and time in ISO 8601, UTC where it does not say."""
+    instant = datetime.fromisoformat(text.strip().replace("Z", "+00:00"))
+    return instant if instant.tzinfo is not None else instant.replace(tzinfo=UTC)
 
 
 def _text(value: Any) -> str:
@@ -89,8 +124,9 @@ class _Source:
     def dataset(self, variable: str) -> h5py.Dataset:
         found = self.group.get(variable)
         if not isinstance(found, h5py.Dataset):
-            raise MissingDataError(f"the variable {variable!r} is missing", where=self.name,
-                                   remedy="write it as the campaign format says")
+            raise MissingDataError(
+                f"the variable {variable!r} is missing", where=self.name, remedy="write it as the campaign format says"
+            )
         return found
 
     def attribute(self, variable: str, attribute: str) -> Any:
@@ -105,8 +141,12 @@ class _Source:
         data = self.dataset(variable)
         where = self.where(variable)
         if data.dtype.kind not in "fiub":
-            raise FileFormatError("the variable does not hold real numbers", where=where, value=str(data.dtype),
-                                  limit="floating point or integer")
+            raise FileFormatError(
+                "the variable does not hold real numbers",
+                where=where,
+                value=str(data.dtype),
+                limit="floating point or integer",
+            )
         values = np.empty(data.shape, dtype=np.float64)
         if data.shape is None or data.size == 0:
             values = np.empty(data.shape or (0,), dtype=np.float64)
@@ -123,11 +163,32 @@ class _Source:
             values *= float(np.asarray(scale).reshape(-1)[0])
         if offset is not None:
             values += float(np.asarray(offset).reshape(-1)[0])
-        factor = _factor(self.units(variable), unit, where)
+        factor = _factor(self._plain_units(variable), unit, where)
         if factor != 1.0:
             values *= factor
         _require_shape(values, shape, where)
         return values
+
+    def _plain_units(self, variable: str) -> str | None:
+        """The units attribute; "seconds since <date>" is accepted where the date is the epoch of the campaign."""
+        stated = self.units(variable)
+        if stated is None or " since " not in stated:
+            return stated
+        unit, _, origin = stated.partition(" since ")
+        epoch = _text(self.group.file.attrs.get("epoch", ""))
+        try:
+            same = _instant(origin) == _instant(epoch)
+        except ValueError:
+            same = False
+        if not same:
+            raise UnitError(
+                "the times count from another instant than the epoch of the campaign",
+                where=self.where(variable),
+                value=repr(stated),
+                limit=f"since {epoch}",
+                remedy="give times in seconds after the root attribute 'epoch'",
+            )
+        return unit
 
     def strings(self, variable: str) -> list[str]:
         data = self.dataset(variable)
@@ -135,16 +196,21 @@ class _Source:
         if data.dtype.kind == "S" and data.dtype.itemsize == 1 and data.ndim == 2:  # characters, one row a string
             return [b"".join(row.tolist()).decode("utf-8", "replace").strip().rstrip("\0") for row in values]
         if data.dtype.kind not in "SO" and h5py.check_string_dtype(data.dtype) is None:
-            raise FileFormatError("the variable does not hold strings", where=self.where(variable),
-                                  value=str(data.dtype), limit="strings")
+            raise FileFormatError(
+                "the variable does not hold strings", where=self.where(variable), value=str(data.dtype), limit="strings"
+            )
         return [_text(v) for v in np.atleast_1d(values)]
 
     def require_frame(self, variable: str, frame: str) -> None:
         stated = self.attribute(variable, "frame")
         if stated is not None and _text(stated).strip() not in {frame, ""}:
-            raise FileFormatError("the frame attribute names another frame", where=self.where(variable),
-                                  value=repr(_text(stated)), limit=repr(frame),
-                                  remedy=f"transform the data to the {frame} frame")
+            raise FileFormatError(
+                "the frame attribute names another frame",
+                where=self.where(variable),
+                value=repr(_text(stated)),
+                limit=repr(frame),
+                remedy=f"transform the data to the {frame} frame",
+            )
 
     def standard_deviation(self, variable: str, unit: str, shape: tuple[int, int]) -> np.ndarray:
         """Standard deviations of shape ``shape``, from the variable beside the data or from the attribute."""
@@ -154,15 +220,19 @@ class _Source:
         stated = self.attribute(variable, "standard_deviation")
         where = f"{self.where(variable)}.standard_deviation"
         if stated is None:
-            raise MissingDataError("the accuracy of the measurement is missing", where=where,
-                                   remedy=f"add the attribute in {unit}, or the variable {beside!r}")
+            raise MissingDataError(
+                "the accuracy of the measurement is missing",
+                where=where,
+                remedy=f"add the attribute in {unit}, or the variable {beside!r}",
+            )
         try:
             values = np.asarray(stated, dtype=np.float64).reshape(-1)
         except (TypeError, ValueError) as error:
             raise FileFormatError("the attribute does not hold numbers", where=where, value=repr(stated)) from error
         if values.size not in (1, shape[1]):
-            raise ShapeError("the attribute has the wrong number of values", where=where, value=values.size,
-                             limit=f"1 or {shape[1]}")
+            raise ShapeError(
+                "the attribute has the wrong number of values", where=where, value=values.size, limit=f"1 or {shape[1]}"
+            )
         units = self.units(variable, "standard_deviation_units")
         if units is None and unit not in {"rad"}:  # the accuracy is in the unit of the data it belongs to
             units = self.units(variable)
@@ -173,11 +243,17 @@ class _Source:
 def _require_shape(values: np.ndarray, shape: tuple[int | None, ...], where: str) -> None:
     """The number of dimensions and every fixed length agree."""
     fits = values.ndim == len(shape) and all(
-        want is None or have == want for have, want in zip(values.shape, shape, strict=True))
+        want is None or have == want for have, want in zip(values.shape, shape, strict=True)
+    )
     if not fits:
         wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
-        raise ShapeError("the array has the wrong shape", where=where, value=values.shape, limit=wanted,
-                         remedy="the time dimension comes first, components last")
+        raise ShapeError(
+            "the array has the wrong shape",
+            where=where,
+            value=values.shape,
+            limit=wanted,
+            remedy="the time dimension comes first, components last",
+        )
 
 
 def _number(attributes: Mapping[str, Any], name: str, unit: str) -> float:
@@ -187,8 +263,7 @@ def _number(attributes: Mapping[str, Any], name: str, unit: str) -> float:
     try:
         return float(np.asarray(attributes[name], dtype=np.float64).reshape(-1)[0])
     except (TypeError, ValueError, IndexError) as error:
-        raise FileFormatError("the root attribute is not a number", where=name,
-                              value=repr(attributes[name])) from error
+        raise FileFormatError("the root attribute is not a number", where=name, value=repr(attributes[name])) from error
 
 
 @contextmanager
@@ -201,11 +276,14 @@ def _opened(path: Path) -> Iterator[h5py.File]:
             yield file
     except InputError:
         raise
-    except (OSError, KeyError, RuntimeError, EOFError) as error:
+    except (OSError, KeyError, RuntimeError, EOFError, TypeError, ValueError, MemoryError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise FileFormatError(f"the file is truncated, damaged or not NetCDF-4 ({reason})", where=str(path),
-                              value=f"{path.stat().st_size} bytes",
-                              remedy="copy or write it again; NetCDF-3 files must be converted to NetCDF-4") from error
+        raise FileFormatError(
+            f"the file is truncated, damaged or not NetCDF-4 ({reason})",
+            where=str(path),
+            value=f"{path.stat().st_size} bytes",
+            remedy="copy or write it again; NetCDF-3 files must be converted to NetCDF-4",
+        ) from error
 
 
 def read_campaign(path: str | os.PathLike[str]) -> Campaign:
@@ -237,9 +315,11 @@ def _group(file: h5py.File, name: str, *, required: bool) -> _Source | None:
         return _Source(found, name)
     if required:
         present = ", ".join(sorted(k for k, v in file.items() if isinstance(v, h5py.Group))) or "none"
-        raise MissingDataError(f"the group {name!r} is missing (groups present: {present})",
-                               where=Path(file.filename).name,
-                               remedy="a campaign file needs the groups gnss, star_tracker and nominal")
+        raise MissingDataError(
+            f"the group {name!r} is missing (groups present: {present})",
+            where=Path(file.filename).name,
+            remedy="a campaign file needs the groups gnss, star_tracker and nominal",
+        )
     return None
 
 
@@ -307,15 +387,17 @@ def _read_doppler(source: _Source) -> DopplerSeries:
     except (TypeError, ValueError, IndexError) as error:
         raise FileFormatError("the attribute is not a number", where=where, value=repr(carrier)) from error
     frequency *= _factor(source.units("frequency_shift", "carrier_frequency_units"), "Hz", where)
-    return DopplerSeries(time, shift, source.standard_deviation("frequency_shift", "Hz", shift.shape), direction,
-                         frequency)
+    return DopplerSeries(
+        time, shift, source.standard_deviation("frequency_shift", "Hz", shift.shape), direction, frequency
+    )
 
 
 def _read_torque(source: _Source) -> TorqueCommands:
     start = source.numbers("start", "s", (None,))
     source.require_frame("command", "actuator")
-    return TorqueCommands(start, source.numbers("stop", "s", (start.size,)),
-                          source.numbers("command", "N m", (start.size, 3)))
+    return TorqueCommands(
+        start, source.numbers("stop", "s", (start.size,)), source.numbers("command", "N m", (start.size, 3))
+    )
 
 
 def _read_arcs(source: _Source) -> tuple[Arc, ...]:
@@ -325,16 +407,22 @@ def _read_arcs(source: _Source) -> tuple[Arc, ...]:
     names = source.strings("name") if "name" in source else [f"arc-{i + 1}" for i in range(start.size)]
     for variable, values in (("kind", kinds), ("name", names)):
         if len(values) != start.size:
-            raise ShapeError("the array has the wrong shape", where=source.where(variable), value=len(values),
-                             limit=start.size)
-    return tuple(Arc(name, cast(ArcKind, kind), float(a), float(b))
-                 for name, kind, a, b in zip(names, kinds, start, stop, strict=True))
+            raise ShapeError(
+                "the array has the wrong shape", where=source.where(variable), value=len(values), limit=start.size
+            )
+    return tuple(
+        Arc(name, cast(ArcKind, kind), float(a), float(b))
+        for name, kind, a, b in zip(names, kinds, start, stop, strict=True)
+    )
 
 
 def _read_nominal(source: _Source) -> Nominal:
     source.require_frame("inertia", "tracker")
-    return Nominal(_quaternions(source, "antenna_from_tracker", None), _quaternions(source, "actuator_from_tracker", None),
-                   source.numbers("inertia", "kg m2", (3, 3)))
+    return Nominal(
+        _quaternions(source, "antenna_from_tracker", None),
+        _quaternions(source, "actuator_from_tracker", None),
+        source.numbers("inertia", "kg m2", (3, 3)),
+    )
 
 
 def _read_housekeeping(source: _Source) -> dict[str, Covariate]:
@@ -398,16 +486,33 @@ def _variable(group: Any, name: str, dimensions: tuple[str, ...], values: Any, *
             variable.attrs[key] = value
 
 
-def _measured(group: Any, name: str, dimensions: tuple[str, ...], values: np.ndarray, deviation: np.ndarray,
-              deviation_dimensions: tuple[str, ...], unit: str, deviation_unit: str, **attributes: Any) -> None:
+def _measured(
+    group: Any,
+    name: str,
+    dimensions: tuple[str, ...],
+    values: np.ndarray,
+    deviation: np.ndarray,
+    deviation_dimensions: tuple[str, ...],
+    unit: str,
+    deviation_unit: str,
+    **attributes: Any,
+) -> None:
     """A measured variable with its accuracy: an attribute where that is constant, a variable beside it where not."""
     constant = deviation.shape[0] > 0 and (deviation.strides[0] == 0 or bool(np.all(deviation == deviation[0])))
     row = np.array(deviation[0]) if constant else None
     if row is not None and name == "frequency_shift" and bool(np.all(row == row[0])):
         row = row[0]
     same = deviation_unit == unit
-    _variable(group, name, dimensions, values, units=unit, standard_deviation=row,
-              standard_deviation_units=None if same or row is None else deviation_unit, **attributes)
+    _variable(
+        group,
+        name,
+        dimensions,
+        values,
+        units=unit,
+        standard_deviation=row,
+        standard_deviation_units=None if same or row is None else deviation_unit,
+        **attributes,
+    )
     if row is None:
         _variable(group, f"{name}_standard_deviation", deviation_dimensions, deviation, units=deviation_unit)
 
@@ -417,19 +522,46 @@ def _write_series(file: Any, campaign: Campaign) -> None:
     group = file.create_group("gnss")
     gnss = campaign.gnss
     _variable(group, "time", ("time",), gnss.time, **time_attributes)
-    _measured(group, "position", ("time", "xyz"), gnss.position, gnss.standard_deviation, ("time", "xyz"), "m", "m",
-              frame="earth_fixed")
+    _measured(
+        group,
+        "position",
+        ("time", "xyz"),
+        gnss.position,
+        gnss.standard_deviation,
+        ("time", "xyz"),
+        "m",
+        "m",
+        frame="earth_fixed",
+    )
     group = file.create_group("star_tracker")
     tracker = campaign.star_tracker
     _variable(group, "time", ("time",), tracker.time, **time_attributes)
-    _measured(group, "quaternion", ("time", "wxyz"), tracker.quaternion, tracker.standard_deviation, ("time", "xyz"),
-              "1", "rad", long_name="tracker_from_inertial, scalar first")
+    _measured(
+        group,
+        "quaternion",
+        ("time", "wxyz"),
+        tracker.quaternion,
+        tracker.standard_deviation,
+        ("time", "xyz"),
+        "1",
+        "rad",
+        long_name="tracker_from_inertial, scalar first",
+    )
     if campaign.doppler is not None:
         doppler = campaign.doppler
         group = file.create_group("doppler")
         _variable(group, "time", ("time",), doppler.time, **time_attributes)
-        _measured(group, "frequency_shift", ("time", "beam"), doppler.frequency_shift, doppler.standard_deviation,
-                  ("time", "beam"), "Hz", "Hz", carrier_frequency=float(doppler.carrier_frequency))
+        _measured(
+            group,
+            "frequency_shift",
+            ("time", "beam"),
+            doppler.frequency_shift,
+            doppler.standard_deviation,
+            ("time", "beam"),
+            "Hz",
+            "Hz",
+            carrier_frequency=float(doppler.carrier_frequency),
+        )
         dimensions = ("time", "beam", "xyz") if doppler.beam_direction.ndim == 3 else ("beam", "xyz")
         _variable(group, "beam_direction", dimensions, doppler.beam_direction, units="1", frame="antenna")
     if campaign.housekeeping:
@@ -437,8 +569,11 @@ def _write_series(file: Any, campaign: Campaign) -> None:
         times = [c.time for c in campaign.housekeeping.values()]
         for name, covariate in campaign.housekeeping.items():
             if not np.array_equal(covariate.time, times[0]):
-                raise ShapeError("the series has other times than the first one", where=f"housekeeping/{name}",
-                                 remedy="interpolate all housekeeping to common times")
+                raise ShapeError(
+                    "the series has other times than the first one",
+                    where=f"housekeeping/{name}",
+                    remedy="interpolate all housekeeping to common times",
+                )
         _variable(group, "time", ("time",), times[0], **time_attributes)
         for name, covariate in campaign.housekeeping.items():
             _variable(group, name, ("time",), covariate.values, units=covariate.unit)

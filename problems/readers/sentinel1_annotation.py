@@ -122,9 +122,13 @@ def read_annotation(path: str | os.PathLike[str]) -> Annotation:
     root = xml_root(path)
     header = root.find("adsHeader")
     if root.tag != "product" or header is None:
-        raise FileFormatError("this is no Sentinel-1 product annotation", where=str(path),
-                              value=f"root element {root.tag!r}", limit="'product' with 'adsHeader'",
-                              remedy="take the files from the folder 'annotation' of the product, not 'calibration' or 'rfi'")
+        raise FileFormatError(
+            "this is no Sentinel-1 product annotation",
+            where=str(path),
+            value=f"root element {root.tag!r}",
+            limit="'product' with 'adsHeader'",
+            remedy="take the files from the folder 'annotation' of the product, not 'calibration' or 'rfi'",
+        )
     name = path.name
 
     def text(element: str) -> str:
@@ -137,12 +141,23 @@ def read_annotation(path: str | os.PathLike[str]) -> Annotation:
     terrain = [e for e in root.findall(".//terrainHeightList/terrainHeight") if e.find("value") is not None]
     samples = root.findtext(".//imageInformation/numberOfSamples")
     return Annotation(
-        path=path, mission=text("missionId"), product_type=text("productType"), mode=text("mode"), swath=text("swath"),
-        polarisation=text("polarisation"), data_take=text("missionDataTakeId"), start=limits[0], stop=limits[1],
+        path=path,
+        mission=text("missionId"),
+        product_type=text("productType"),
+        mode=text("mode"),
+        swath=text("swath"),
+        polarisation=text("polarisation"),
+        data_take=text("missionDataTakeId"),
+        start=limits[0],
+        stop=limits[1],
         processor_version=(root.findtext(".//softwareVersion") or "").strip(),
-        radar_frequency=value("radarFrequency"), range_sampling_rate=value("rangeSamplingRate"),
-        slant_range_time=value("imageInformation/slantRangeTime"), samples=int(samples) if samples else 0,
-        orbit=_orbit(root, name), attitude=_attitude(root, name), estimates=_estimates(root, name),
+        radar_frequency=value("radarFrequency"),
+        range_sampling_rate=value("rangeSamplingRate"),
+        slant_range_time=value("imageInformation/slantRangeTime"),
+        samples=int(samples) if samples else 0,
+        orbit=_orbit(root, name),
+        attitude=_attitude(root, name),
+        estimates=_estimates(root, name),
         terrain_time=times([e.findtext("azimuthTime") for e in terrain], f"{name}: terrainHeight"),
         terrain_height=np.array([number(e.findtext("value"), f"{name}: terrainHeight") for e in terrain]),
     )
@@ -152,13 +167,18 @@ def _list(root: Any, path: str, name: str, frame: str | None) -> list[Any]:
     """The elements of a list that must not be empty, all in one frame."""
     elements = root.findall(f".//{path}")
     if not elements:
-        raise MissingDataError(f"the list {path!r} is missing or empty", where=name,
-                               remedy="use a product whose annotation carries it")
+        raise MissingDataError(
+            f"the list {path!r} is missing or empty", where=name, remedy="use a product whose annotation carries it"
+        )
     if frame is not None:
         other = {(e.findtext("frame") or frame).strip() for e in elements} - {frame}
         if other:
-            raise FileFormatError("the list is given in another frame", where=f"{name}: {path}",
-                                  value=", ".join(sorted(other)), limit=frame)
+            raise FileFormatError(
+                "the list is given in another frame",
+                where=f"{name}: {path}",
+                value=", ".join(sorted(other)),
+                limit=frame,
+            )
     return list(elements)
 
 
@@ -180,8 +200,12 @@ def _attitude(root: Any, name: str) -> AttitudeVectors:
     length = np.linalg.norm(quaternion, axis=1)
     if np.abs(length - 1).max() > 1e-3:  # seven digits are printed; more than that is damage
         k = int(np.argmax(np.abs(length - 1)))
-        raise QuaternionError("the quaternion is not of unit length", where=f"{where}[{k}]", value=f"{length[k]:.6g}",
-                              limit="1 within 0.001")
+        raise QuaternionError(
+            "the quaternion is not of unit length",
+            where=f"{where}[{k}]",
+            value=f"{length[k]:.6g}",
+            limit="1 within 0.001",
+        )
     _, order = np.unique(time, return_index=True)
     quaternion = (quaternion / length[:, None])[order]
     flips = np.einsum("ij,ij->i", quaternion[1:], quaternion[:-1]) < 0
@@ -201,12 +225,18 @@ def _estimates(root: Any, name: str) -> tuple[DopplerEstimate, ...]:
     found = []
     for k, element in enumerate(elements):
         fine = element.findall("fineDceList/fineDce")
-        found.append(DopplerEstimate(
-            time=time[k], reference=number(element.findtext("t0"), f"{where}[{k}]: t0"),
-            geometry=_polynomial(element, "geometryDcPolynomial", f"{where}[{k}]"),
-            measured=_polynomial(element, "dataDcPolynomial", f"{where}[{k}]"),
-            rms=number(element.findtext("dataDcRmsError") or "0", f"{where}[{k}]: dataDcRmsError"),
-            trusted=(element.findtext("dataDcRmsErrorAboveThreshold") or "false").strip().lower() != "true",
-            fine_slant_time=np.array([number(f.findtext("slantRangeTime"), f"{where}[{k}]: fineDce") for f in fine]),
-            fine_frequency=np.array([number(f.findtext("frequency"), f"{where}[{k}]: fineDce") for f in fine])))
+        found.append(
+            DopplerEstimate(
+                time=time[k],
+                reference=number(element.findtext("t0"), f"{where}[{k}]: t0"),
+                geometry=_polynomial(element, "geometryDcPolynomial", f"{where}[{k}]"),
+                measured=_polynomial(element, "dataDcPolynomial", f"{where}[{k}]"),
+                rms=number(element.findtext("dataDcRmsError") or "0", f"{where}[{k}]: dataDcRmsError"),
+                trusted=(element.findtext("dataDcRmsErrorAboveThreshold") or "false").strip().lower() != "true",
+                fine_slant_time=np.array(
+                    [number(f.findtext("slantRangeTime"), f"{where}[{k}]: fineDce") for f in fine]
+                ),
+                fine_frequency=np.array([number(f.findtext("frequency"), f"{where}[{k}]: fineDce") for f in fine]),
+            )
+        )
     return tuple(sorted(found, key=lambda estimate: estimate.time))

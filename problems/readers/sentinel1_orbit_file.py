@@ -59,14 +59,19 @@ def xml_root(path: Path) -> Any:
     try:
         return parse(path, forbid_dtd=True).getroot()
     except DefusedXmlException as error:
-        raise FileFormatError(f"the XML declares entities or a document type, which is refused ({type(error).__name__})",
-                              where=str(path), remedy="use the file as the data provider delivers it") from error
+        raise FileFormatError(
+            f"the XML declares entities or a document type, which is refused ({type(error).__name__})",
+            where=str(path),
+            remedy="use the file as the data provider delivers it",
+        ) from error
     except (ParseError, UnicodeDecodeError, LookupError, ValueError) as error:
-        raise FileFormatError(f"the file is no well-formed XML ({error})", where=str(path),
-                              remedy="download it again") from error
+        raise FileFormatError(
+            f"the file is no well-formed XML ({error})", where=str(path), remedy="download it again"
+        ) from error
     except OSError as error:
-        raise FileFormatError(f"the file cannot be read ({error.strerror})", where=str(path),
-                              remedy="check the path") from error
+        raise FileFormatError(
+            f"the file cannot be read ({error.strerror})", where=str(path), remedy="check the path"
+        ) from error
 
 
 def number(text: str | None, where: str) -> float:
@@ -109,13 +114,18 @@ def read_orbit_file(path: str | os.PathLike[str]) -> OrbitFile:
     path = Path(path)
     root = xml_root(path)
     if root.tag.rsplit("}", 1)[-1] != "Earth_Explorer_File":
-        raise FileFormatError("this is no orbit file", where=str(path), value=f"root element {root.tag!r}",
-                              limit="'Earth_Explorer_File'")
+        raise FileFormatError(
+            "this is no orbit file", where=str(path), value=f"root element {root.tag!r}", limit="'Earth_Explorer_File'"
+        )
     frame = (root.findtext(".//{*}Ref_Frame") or "EARTH_FIXED").strip()
     scale = (root.findtext(".//{*}Time_Reference") or "UTC").strip()
     if frame != "EARTH_FIXED" or scale != "UTC":
-        raise FileFormatError("the orbit file uses another frame or time scale", where=str(path),
-                              value=f"{frame}, {scale}", limit="EARTH_FIXED, UTC")
+        raise FileFormatError(
+            "the orbit file uses another frame or time scale",
+            where=str(path),
+            value=f"{frame}, {scale}",
+            limit="EARTH_FIXED, UTC",
+        )
     vectors = [v for v in root.findall(".//{*}OSV") if (v.findtext("{*}Quality") or "").strip() != "DEGRADED"]
     if not vectors:
         raise MissingDataError("the orbit file has no state vectors", where=str(path))
@@ -125,5 +135,9 @@ def read_orbit_file(path: str | os.PathLike[str]) -> OrbitFile:
     velocity = np.array([[number(v.findtext(f"{{*}}{axis}"), where) for axis in ("VX", "VY", "VZ")] for v in vectors])
     mission = (root.findtext(".//{*}Mission") or "").strip()
     _, order = np.unique(time, return_index=True)
-    return OrbitFile(path, mission.replace("Sentinel-", "S"), (root.findtext(".//{*}File_Type") or "").strip(),
-                     StateVectors(time[order], position[order], velocity[order]))
+    return OrbitFile(
+        path,
+        mission.replace("Sentinel-", "S"),
+        (root.findtext(".//{*}File_Type") or "").strip(),
+        StateVectors(time[order], position[order], velocity[order]),
+    )
