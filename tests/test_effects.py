@@ -600,3 +600,9 @@ def test_the_library_costs_no_heavy_import() -> None:
             "print([m for m in ('astropy', 'ppigrf', 'matplotlib', 'pandas', 'xarray') if m in sys.modules])")
     answer = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=True)
     assert answer.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("name", sorted(SHIPPED))
+def test_instances_of_one_layout_are_the_same(name: str) -> None:
+    assert SHIPPED[name].instances(EXAMPLE) == SHIPPED[name].instances(EXAMPLE)
+    assert len({hash(i) for i in SHIPPED[name].instances(EXAMPLE)}) == len(SHIPPED[name].instances(EXAMPLE))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import casadi as ca
 
 from estimator.effects.declaration import Effect, EffectInstance, Layout, Parameter, Sample, register
@@ -39,6 +41,7 @@ def _instance(layout: Layout, beam: int) -> EffectInstance:
                           zero="both angles = 0", reference="rotation of one beam's unit vector in antenna axes")
 
 
+@functools.lru_cache(maxsize=64)  # equal instances on equal layouts: their kernels are built once
 def _instances(layout: Layout) -> tuple[EffectInstance, ...]:
     return tuple(_instance(layout, beam) for beam in range(layout.beams))
 

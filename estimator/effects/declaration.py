@@ -195,7 +195,8 @@ class Effect:
         name: the fixed name of the API, the command line and the reports.
         channel: the residual or equation that it changes.
         summary: one sentence for the generated documentation page.
-        instances: from the layout of a campaign to the instances that exist on it (usually one).
+        instances: from the layout of a campaign to the instances that exist on it (usually one); the same objects for
+            the same layout, because compiled kernels are kept by them.
         formula: the contribution as text, for the documentation page.
     """
 

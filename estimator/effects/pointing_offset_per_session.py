@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import casadi as ca
 
 from estimator.effects.declaration import Effect, EffectInstance, Layout, Parameter, Sample, axes, register
@@ -12,6 +14,7 @@ NAME = "pointing-offset-per-session"
 MARGIN = 1e-6  # s, so that a sample at the border of its session belongs to it
 
 
+@functools.lru_cache(maxsize=64)  # equal instances on equal layouts: their kernels are built once
 def _instances(layout: Layout) -> tuple[EffectInstance, ...]:
     if not layout.sessions:
         return ()

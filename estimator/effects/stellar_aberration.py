@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import casadi as ca
 
 from estimator.effects.declaration import Effect, EffectInstance, Layout, Parameter, Sample, register
@@ -28,6 +30,7 @@ def rotation_of_field(boresight: Matrix, velocity: Matrix) -> Matrix:
     return ca.cross(boresight, beta) * (1 + gamma / (1 + gamma) * along) / (1 + along)
 
 
+@functools.lru_cache(maxsize=64)  # equal instances on equal layouts: their kernels are built once
 def _instances(layout: Layout) -> tuple[EffectInstance, ...]:
     boresight = ca.DM(layout.tracker_boresight)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import casadi as ca
 
 from estimator.effects.declaration import Effect, EffectInstance, Layout, Parameter, Sample, axes, register
@@ -17,6 +19,7 @@ def contribution(sample: Sample, p: Matrix) -> Matrix:
     return (1 + ca.tanh((sample.time - p[3]) / (2 * WIDTH))) / 2 * p[:3]
 
 
+@functools.lru_cache(maxsize=64)  # equal instances on equal layouts: their kernels are built once
 def _instances(layout: Layout) -> tuple[EffectInstance, ...]:
     first, last = layout.tracker_span
     if last <= first:
