@@ -70,14 +70,25 @@ def test_tables_of_other_kinds_give_the_same_star(tmp_path: Path, text: str) -> 
 
 
 def test_json_by_columns_and_under_a_key(tmp_path: Path) -> None:
-    by_columns = read_star_catalogue(write(tmp_path / "a.json", {"id": [1, 2], "ra": [10.0, 20.0], "dec": [1.0, 2.0], "mag": [3, 4]}))
-    under_key = read_star_catalogue(write(tmp_path / "b.json", {"epoch": 2000, "stars": [{"id": 1, "ra": 10, "dec": 1, "mag": 3},
-                                                                                        {"id": 2, "ra": 20, "dec": 2, "mag": 4}]}))
+    by_columns = read_star_catalogue(
+        write(tmp_path / "a.json", {"id": [1, 2], "ra": [10.0, 20.0], "dec": [1.0, 2.0], "mag": [3, 4]})
+    )
+    under_key = read_star_catalogue(
+        write(
+            tmp_path / "b.json",
+            {
+                "epoch": 2000,
+                "stars": [{"id": 1, "ra": 10, "dec": 1, "mag": 3}, {"id": 2, "ra": 20, "dec": 2, "mag": 4}],
+            },
+        )
+    )
     np.testing.assert_array_equal(by_columns.directions(), under_key.directions())
 
 
 def test_records_without_a_position_are_left_out_and_counted(tmp_path: Path) -> None:
-    stars = read_star_catalogue(write(tmp_path / "a.json", [*RECORDS, {"HR": "92", "RA": "", "Dec": "", "V": "5"}, {"HR": "95", "V": "5"}]))
+    stars = read_star_catalogue(
+        write(tmp_path / "a.json", [*RECORDS, {"HR": "92", "RA": "", "Dec": "", "V": "5"}, {"HR": "95", "V": "5"}])
+    )
     assert len(stars) == 3 and stars.skipped == 2
 
 
@@ -92,7 +103,9 @@ def test_proper_motion_moves_the_star(tmp_path: Path) -> None:
 
 def test_blends_keep_the_brighter_star() -> None:
     ra = np.radians([10.0, 10.001, 50.0])
-    stars = StarCatalogue(np.array(["a", "b", "c"]), np.array(["", "", ""]), ra, np.zeros(3), np.array([4.0, 2.0, 3.0]), np.zeros((3, 2)))
+    stars = StarCatalogue(
+        np.array(["a", "b", "c"]), np.array(["", "", ""]), ra, np.zeros(3), np.array([4.0, 2.0, 3.0]), np.zeros((3, 2))
+    )
     assert list(stars.without_blends(np.radians(0.01)).identifier) == ["b", "c"]
     assert len(stars.without_blends(np.radians(1e-4))) == 3
 
@@ -101,7 +114,7 @@ def test_blends_keep_the_brighter_star() -> None:
     ("content", "error", "words"),
     [
         ("", FileFormatError, "header"),
-        ("[{\"RA\": ", FileFormatError, "JSON"),
+        ('[{"RA": ', FileFormatError, "JSON"),
         ("[1, 2]", FileFormatError, "list of star records"),
         ("id,ra,dec\n1,2,3\n", MissingDataError, "magnitude"),
         ("id,ra,dec,mag\n1,2\n", FileFormatError, "short"),
@@ -115,7 +128,9 @@ def test_blends_keep_the_brighter_star() -> None:
         ({"ra": [1.0, 2.0], "dec": [1.0], "mag": [1, 2]}, FileFormatError, "length"),
     ],
 )
-def test_files_that_are_not_fit_are_refused_with_reasons(tmp_path: Path, content: object, error: type[Exception], words: str) -> None:
+def test_files_that_are_not_fit_are_refused_with_reasons(
+    tmp_path: Path, content: object, error: type[Exception], words: str
+) -> None:
     with pytest.raises(error, match=words):
         read_star_catalogue(write(tmp_path / "a.txt", content))
 
@@ -130,6 +145,8 @@ def test_missing_binary_and_ambiguous_files(tmp_path: Path) -> None:
     hours = write(tmp_path / "h.csv", "id,ra,dec,mag\n" + rows)
     with pytest.raises(UnitError, match="look like hours"):
         read_star_catalogue(hours)
-    assert np.degrees(read_star_catalogue(hours, right_ascension_unit="hour").right_ascension.max()) == pytest.approx(358.8)
+    assert np.degrees(read_star_catalogue(hours, right_ascension_unit="hour").right_ascension.max()) == pytest.approx(
+        358.8
+    )
     with pytest.raises(RequestError):
         read_star_catalogue(hours, right_ascension_unit="gon")

@@ -30,8 +30,8 @@ def test_criteria_are_the_matrix_form(count: int) -> None:
         axis = random_directions(1, seed)[0]
         p = matrix_form(b)
         found = criteria.criteria_of(b, axis)
-        assert found.K0 == pytest.approx(np.trace(p), rel=1e-12)
-        assert found.K1 == pytest.approx(axis @ (np.trace(p) * np.eye(3) - p) @ axis, rel=1e-12)
+        assert pytest.approx(np.trace(p), rel=1e-12) == found.K0
+        assert pytest.approx(axis @ (np.trace(p) * np.eye(3) - p) @ axis, rel=1e-12) == found.K1
         np.testing.assert_allclose(found.covariance, p, rtol=0, atol=1e-12 * np.trace(p))
 
 
@@ -53,7 +53,9 @@ def test_casadi_function_gives_the_same_and_its_gradient_is_right() -> None:
                 forward, back = b.T.copy(), b.T.copy()
                 forward[i, j] += step
                 back[i, j] -= step
-                difference = (float(function(forward, sigma, axis)[index]) - float(function(back, sigma, axis)[index])) / (2 * step)
+                difference = (
+                    float(function(forward, sigma, axis)[index]) - float(function(back, sigma, axis)[index])
+                ) / (2 * step)
                 assert exact[i, j] == pytest.approx(difference, rel=1e-6, abs=1e-7)
 
 
@@ -86,7 +88,7 @@ def test_unequal_accuracies_are_repeated_sightings() -> None:
     b = random_directions(3, 7)
     once = criteria.criteria_of(np.vstack((b, b[:1], b[:1], b[:1])))
     weighted = criteria.criteria_of(b, sigma=[0.5, 1, 1])
-    assert weighted.K0 == pytest.approx(once.K0, rel=1e-13)
+    assert pytest.approx(once.K0, rel=1e-13) == weighted.K0
     np.testing.assert_allclose(weighted.covariance, once.covariance, rtol=1e-12, atol=1e-14)
 
 
@@ -128,7 +130,9 @@ def test_the_published_table_attains_the_minimum_only_in_the_right_reading(count
     # The table is printed to five figures: an error of 1e-5 rad leaves about its square. Row 5 has 1.1e-9.
     assert -1e-14 < excess < 2e-9
     latitude, longitude = (np.radians(np.array(a, dtype=float)) for a in closed_form.PUBLISHED_TABLE[count])
-    wrong = np.column_stack((np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)))
+    wrong = np.column_stack(
+        (np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude))
+    )
     if count >= 4:
         assert closed_form.K0_any(wrong @ wrong.T) / closed_form.least_K0(count) - 1 > 0.01
 
@@ -137,11 +141,11 @@ def test_the_published_table_attains_the_minimum_only_in_the_right_reading(count
 def test_the_best_axis_of_two_stars_is_the_sum_or_the_difference_bisector(cosine: float) -> None:
     first, second = np.array([0.0, 0.0, 1.0]), np.array([np.sqrt(1 - cosine**2), 0.0, cosine])
     best = closed_form.best_axis_two(first, second)
-    assert criteria.criteria_of([first, second], best).K1 == pytest.approx(closed_form.least_K1_two(cosine), rel=1e-12)
+    assert pytest.approx(closed_form.least_K1_two(cosine), rel=1e-12) == criteria.criteria_of([first, second], best).K1
     other = first - second if cosine > 0 else first + second
     # With the other bisector the sign of c changes: (1/2)(1/2 + 1/(1 - |c|)).
     wrong = 0.5 * (0.5 + 1 / (1 - abs(cosine)))
-    assert criteria.criteria_of([first, second], other).K1 == pytest.approx(wrong, rel=1e-12)
+    assert pytest.approx(wrong, rel=1e-12) == criteria.criteria_of([first, second], other).K1
     if abs(cosine) == 0.7:
         assert closed_form.least_K1_two(cosine) == pytest.approx(0.5441, abs=5e-5)
         assert wrong == pytest.approx(1.9167, abs=5e-5)
@@ -159,20 +163,22 @@ def test_the_limit_along_the_axis_and_its_price() -> None:
         b = np.column_stack((np.sin(cone) * np.cos(azimuth), np.sin(cone) * np.sin(azimuth), np.full(4, np.cos(cone))))
         found = criteria.criteria_of(b, [0, 0, 1])
         assert (found.K1, found.covariance[2, 2]) == pytest.approx(closed_form.ring_criteria(4, cone), rel=1e-9)
-        assert found.K1 * 4 == pytest.approx(ratio, rel=1e-4)
+        assert pytest.approx(ratio, rel=1e-4) == found.K1 * 4
         assert found.covariance[2, 2] == pytest.approx(roll, rel=0.03)
-        assert found.K1 > closed_form.limit_K1(4)
+        assert closed_form.limit_K1(4) < found.K1
 
 
 def test_what_one_direction_leaves_open_is_named() -> None:
     found = criteria.criteria_of([[0, 0, 2.0]], [0, 0, 1])
-    assert found.K0 == np.inf and found.covariance is None
+    assert np.inf == found.K0 and found.covariance is None
     np.testing.assert_allclose(np.abs(found.unobservable), [[0, 0, 1]], atol=1e-12)
-    assert found.K1 == pytest.approx(1.0)  # the axis itself is seen
-    assert criteria.criteria_of([[0, 0, 1], [0, 0, -1]], [1, 0, 0]).K1 == np.inf  # an axis that the unseen turn moves
+    assert pytest.approx(1.0) == found.K1  # the axis itself is seen
+    assert np.inf == criteria.criteria_of([[0, 0, 1], [0, 0, -1]], [1, 0, 0]).K1  # an axis that the unseen turn moves
 
 
-@pytest.mark.parametrize(("value", "error"), [([[1, 2]], ShapeError), ([[0, 0, 0]], RequestError), ([[np.nan, 0, 1]], NotFiniteError)])
+@pytest.mark.parametrize(
+    ("value", "error"), [([[1, 2]], ShapeError), ([[0, 0, 0]], RequestError), ([[np.nan, 0, 1]], NotFiniteError)]
+)
 def test_bad_directions_are_refused(value: list[list[float]], error: type[Exception]) -> None:
     with pytest.raises(error):
         criteria.criteria_of(value)
@@ -190,14 +196,24 @@ def quest_covariance(directions: np.ndarray, sigma_axis: np.ndarray) -> np.ndarr
     return total * np.linalg.inv(np.eye(3) - np.einsum("n,ni,nj->ij", a, directions, directions))
 
 
-def wahba_errors(directions: np.ndarray, noise_first: np.ndarray, noise_second: np.ndarray, first: np.ndarray, weights: np.ndarray,
-                 samples: int, seed: int) -> np.ndarray:
-    """Attitude errors (samples x 3, body axes) of Wahba's solution by SVD, for noise along two axes of each direction."""
+def wahba_errors(
+    directions: np.ndarray,
+    noise_first: np.ndarray,
+    noise_second: np.ndarray,
+    first: np.ndarray,
+    weights: np.ndarray,
+    samples: int,
+    seed: int,
+) -> np.ndarray:
+    """Attitude errors (samples x 3, body axes) of Wahba's solution by SVD, noise along two axes of each direction."""
     generator = np.random.default_rng(seed)
     second = np.cross(directions, first)
     shape = (samples, len(directions), 1)
-    measured = (directions + noise_first[:, None] * generator.standard_normal(shape) * first
-                + noise_second[:, None] * generator.standard_normal(shape) * second)
+    measured = (
+        directions
+        + noise_first[:, None] * generator.standard_normal(shape) * first
+        + noise_second[:, None] * generator.standard_normal(shape) * second
+    )
     measured /= np.linalg.norm(measured, axis=2)[:, :, None]
     u, _, vt = np.linalg.svd(np.einsum("n,sni,nj->sij", weights, measured, directions))
     sign = np.linalg.det(u) * np.linalg.det(vt)
@@ -237,7 +253,9 @@ def test_two_axis_sensors_weighted_least_squares_attains_the_covariance_and_wahb
     first /= np.linalg.norm(first, axis=1)[:, None]
     second = np.cross(b, first)
     fine, coarse = np.full(3, 1e-5), np.full(3, 1e-4)
-    information = sum(np.array(criteria.two_axis_information(ca.DM(b[i]), ca.DM(first[i]), fine[i], coarse[i])) for i in range(3))
+    information = sum(
+        np.array(criteria.two_axis_information(ca.DM(b[i]), ca.DM(first[i]), fine[i], coarse[i])) for i in range(3)
+    )
     expected = np.linalg.inv(information)
     generator = np.random.default_rng(5)
     samples = 40_000

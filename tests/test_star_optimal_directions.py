@@ -31,7 +31,7 @@ def test_every_row_of_the_table_is_attained(count: int) -> None:
     assert best.status == "ok"
     np.testing.assert_allclose(np.linalg.norm(best.directions, axis=1), 1, atol=4e-16)
     K0 = float(np.trace(matrix_form(best.directions)))
-    assert K0 == pytest.approx(best.K0, rel=1e-13)
+    assert pytest.approx(best.K0, rel=1e-13) == K0
     target = 1.25 if count == 2 else 9 / (4 * count)
     assert -1e-14 < K0 - target < 1e-12
     if count >= 3:  # a tight frame: no axis is worse known than another
@@ -63,24 +63,34 @@ def test_an_independent_optimiser_finds_nothing_better() -> None:
             return float(np.trace(np.linalg.inv(weights.sum() * np.eye(3) - b.T @ (weights[:, None] * b))))
 
         others = [minimize(objective, generator.standard_normal(3 * count), method="BFGS").fun for _ in range(3)]
-        assert best.K0 == pytest.approx(min(others), rel=1e-7)
-        assert best.K0 <= min(others) * (1 + 1e-10)
+        assert pytest.approx(min(others), rel=1e-7) == best.K0
+        assert min(others) * (1 + 1e-10) >= best.K0
 
 
-@pytest.mark.parametrize("sigma", [(1, 1), (1, 0.3), (1, 1, 0.2), (1, 2, 0.5, 0.9), (0.1, 1, 1, 1, 1), (0.4, 0.5, 2, 2, 2)])
+@pytest.mark.parametrize(
+    "sigma", [(1, 1), (1, 0.3), (1, 1, 0.2), (1, 2, 0.5, 0.9), (0.1, 1, 1, 1, 1), (0.4, 0.5, 2, 2, 2)]
+)
 def test_unequal_accuracies_reach_the_majorization_bound(sigma: tuple[float, ...]) -> None:
     best = optimal_directions(Request(len(sigma), sigma=sigma))
     assert best.status == "ok"
-    assert best.K0 == pytest.approx(closed_form.least_K0_unequal(np.array(sigma)), rel=1e-8)
+    assert pytest.approx(closed_form.least_K0_unequal(np.array(sigma)), rel=1e-8) == best.K0
 
 
-@pytest.mark.parametrize(("fixed", "count"), [([[0, 0, 1]], 2), ([[0, 0, 1]], 5), ([[0, 0, 1], [0, 0.1, 1], [0.1, 0, 1]], 3),
-                                              ([[1, 0, 0], [0, 1, 0]], 1), ([[0.3, 0.4, 0.5]] * 4, 3)])
+@pytest.mark.parametrize(
+    ("fixed", "count"),
+    [
+        ([[0, 0, 1]], 2),
+        ([[0, 0, 1]], 5),
+        ([[0, 0, 1], [0, 0.1, 1], [0.1, 0, 1]], 3),
+        ([[1, 0, 0], [0, 1, 0]], 1),
+        ([[0.3, 0.4, 0.5]] * 4, 3),
+    ],
+)
 def test_directions_beside_fixed_sensors_fill_the_poorest_axes(fixed: list[list[float]], count: int) -> None:
     best = optimal_directions(Request(count, fixed=tuple(tuple(f) for f in fixed)))
     rows = np.array(best.request.fixed)
     assert best.status == "ok"
-    assert best.K0 == pytest.approx(closed_form.least_K0_beside_fixed(rows, count), rel=1e-8)
+    assert pytest.approx(closed_form.least_K0_beside_fixed(rows, count), rel=1e-8) == best.K0
     assert float(np.trace(matrix_form(np.vstack((rows, best.directions))))) == pytest.approx(best.K0, rel=1e-12)
 
 
@@ -90,12 +100,12 @@ def test_two_stars_under_an_angle_limit_for_one_axis(degrees: float, axis: tuple
     request = Request(2, "K1", axis=axis, angle_limit=np.radians(degrees))
     best = optimal_directions(request)
     cosine = np.cos(np.radians(degrees))
-    assert best.K1 == pytest.approx(closed_form.least_K1_two(cosine), rel=1e-9)
+    assert pytest.approx(closed_form.least_K1_two(cosine), rel=1e-9) == best.K1
     found = sorted(float(m[0] @ m[1]) for m in senses(request, best.directions))
     assert found == pytest.approx([-cosine, cosine], abs=1e-8)  # both signs
     for member in senses(request, best.directions):
         assert abs(closed_form.best_axis_two(*member) @ best.axis) == pytest.approx(1, abs=1e-8)
-        assert criteria.criteria_of(member, axis).K1 == pytest.approx(best.K1, rel=1e-10)
+        assert pytest.approx(best.K1, rel=1e-10) == criteria.criteria_of(member, axis).K1
 
 
 @pytest.mark.parametrize("count", [2, 3, 5, 12])
@@ -106,7 +116,7 @@ def test_one_axis_without_limits_comes_close_to_its_infimum_and_tells_the_price(
     assert "never attain" in best.why
     assert float(best.axis @ best.covariance @ best.axis) > 100 / count
     if count >= 3:  # evenly on the cone that is kept free
-        assert best.K1 == pytest.approx(closed_form.ring_criteria(count, 0.01)[0], rel=1e-9)
+        assert pytest.approx(closed_form.ring_criteria(count, 0.01)[0], rel=1e-9) == best.K1
 
 
 def test_limits_between_sensors_hold_and_cost() -> None:
@@ -115,11 +125,11 @@ def test_limits_between_sensors_hold_and_cost() -> None:
     assert best.status == "ok" and meets_limits(request, best.directions, 1e-9)
     angles = [np.degrees(np.arccos(a @ b)) for a, b in combinations(best.directions, 2)]
     assert min(angles) > 50 - 1e-6 and max(angles) < 80 + 1e-6
-    assert best.K0 > closed_form.least_K0(4)
+    assert closed_form.least_K0(4) < best.K0
     assert optimal_directions(Request(4)).K0 < best.K0
     # The cube's diagonals meet a limit of 70 degrees between lines (they stand 70.53 apart), and nothing is lost.
     lines = optimal_directions(Request(4, angle_limit=np.radians(70)))
-    assert lines.K0 == pytest.approx(closed_form.least_K0(4), rel=1e-9)
+    assert pytest.approx(closed_form.least_K0(4), rel=1e-9) == lines.K0
 
 
 def test_keep_out_cones_hold() -> None:
@@ -127,12 +137,12 @@ def test_keep_out_cones_hold() -> None:
     request = Request(6, keep_outs=cones)
     best = optimal_directions(request)
     assert best.status == "ok" and meets_limits(request, best.directions, 1e-9)
-    assert best.K0 == pytest.approx(closed_form.least_K0(6), rel=1e-9)  # senses are free: nothing is lost
+    assert pytest.approx(closed_form.least_K0(6), rel=1e-9) == best.K0  # senses are free: nothing is lost
     # Only a cap of 20 degrees left: two stars stand as far apart as it lets them.
     cap = Request(2, keep_outs=(KeepOut((0, 0, -1), np.radians(160), "all but a cap"),))
     tight = optimal_directions(cap)
     assert np.degrees(np.arccos(tight.directions[0] @ tight.directions[1])) == pytest.approx(40, abs=1e-4)
-    assert tight.K0 == pytest.approx(closed_form.K0_two(np.cos(np.radians(40))), rel=1e-7)
+    assert pytest.approx(closed_form.K0_two(np.cos(np.radians(40))), rel=1e-7) == tight.K0
 
 
 def test_two_axis_sensors_share_out_their_turns() -> None:
@@ -144,7 +154,7 @@ def test_two_axis_sensors_share_out_their_turns() -> None:
     total = total_information(best.request, best.directions, best.first_axes)
     # The trace of the information is fixed, 3 (1 + 1/100): the best is an even share, if it can be had.
     np.testing.assert_allclose(np.linalg.eigvalsh(total), 1.01, rtol=1e-4)
-    assert best.K0 == pytest.approx(3 / 1.01, rel=1e-8)
+    assert pytest.approx(3 / 1.01, rel=1e-8) == best.K0
 
 
 @pytest.mark.parametrize(("count", "dimension"), [(2, 0), (3, 0), (4, 0), (5, 2), (6, 4), (9, 10)])
@@ -172,8 +182,8 @@ def test_senses_respect_the_limits() -> None:
 
 def test_one_direction_is_said_to_be_too_few() -> None:
     best = optimal_directions(Request(1))
-    assert best.status == "unobservable" and best.K0 == np.inf and "rotation about the line of sight" in best.why
-    assert optimal_directions(Request(1, fixed=((1, 0, 0),))).K0 == pytest.approx(1.25, rel=1e-9)
+    assert best.status == "unobservable" and np.inf == best.K0 and "rotation about the line of sight" in best.why
+    assert pytest.approx(1.25, rel=1e-9) == optimal_directions(Request(1, fixed=((1, 0, 0),))).K0
 
 
 def test_limits_that_cannot_be_met_are_said_to_be_so_and_by_how_much() -> None:
@@ -188,9 +198,18 @@ def test_limits_that_cannot_be_met_are_said_to_be_so_and_by_how_much() -> None:
         optimal_directions(Request(1, keep_outs=cones))
 
 
-@pytest.mark.parametrize("values", [{"count": 0}, {"count": 3, "criterion": "K2"}, {"count": 3, "axis": (0, 0, 0)},
-                                    {"count": 3, "sigma": (1, 1)}, {"count": 3, "sigma": -1.0}, {"count": 3, "angle_limit": 45.0},
-                                    {"count": 2, "two_axis_sigma": ((1, 1),)}])
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"count": 0},
+        {"count": 3, "criterion": "K2"},
+        {"count": 3, "axis": (0, 0, 0)},
+        {"count": 3, "sigma": (1, 1)},
+        {"count": 3, "sigma": -1.0},
+        {"count": 3, "angle_limit": 45.0},
+        {"count": 2, "two_axis_sigma": ((1, 1),)},
+    ],
+)
 def test_requests_without_meaning_are_refused(values: dict) -> None:
     with pytest.raises(RequestError):
         Request(**values)

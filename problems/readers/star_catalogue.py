@@ -1,7 +1,7 @@
 """Star catalogues: the Yale Bright Star Catalogue as JSON, and CSV or JSON tables of that kind.
 
-A record needs a position and a magnitude; an identifier, a name and proper motions are read where they are. Column names are
-recognised without regard to case:
+A record needs a position and a magnitude; an identifier, a name and proper motions are read where they are. Column
+names are recognised without regard to case:
 
     identifier       hr, hip, id, star, source_id, number
     name             n, name, proper
@@ -11,9 +11,9 @@ recognised without regard to case:
     magnitude        v, vmag, mag, magnitude, phot_g_mean_mag
     proper motion    pmra, pm_ra and pmdec, pm_dec, pmde (mas/yr, right ascension times cosine of the declination)
 
-A right ascension in sexagesimal text is in hours, minutes and seconds (``00h 05m 09.9s``, ``00:05:09.9``); a number is in degrees
-unless its column says otherwise or the caller does. Records without a position (the Yale numbers that are no stars) are
-left out and counted.
+A right ascension in sexagesimal text is in hours, minutes and seconds (``00h 05m 09.9s``, ``00:05:09.9``); a number is
+in degrees unless its column says otherwise or the caller does. Records without a position (the Yale numbers that are
+no stars) are left out and counted.
 """
 
 from __future__ import annotations
@@ -34,9 +34,31 @@ from estimator.models.errors import FileFormatError, MissingDataError, NotFinite
 _COLUMNS: dict[str, tuple[str, ...]] = {
     "identifier": ("hr", "hip", "id", "star", "source_id", "number"),
     "name": ("n", "name", "proper"),
-    "right_ascension": ("ra", "raj2000", "ra_deg", "rightascension", "right_ascension", "_raj2000", "ra_icrs", "ra_hours",
-                        "ra_h", "rarad", "ra_rad"),
-    "declination": ("dec", "dej2000", "decj2000", "dec_deg", "de", "declination", "_dej2000", "de_icrs", "decrad", "dec_rad"),
+    "right_ascension": (
+        "ra",
+        "raj2000",
+        "ra_deg",
+        "rightascension",
+        "right_ascension",
+        "_raj2000",
+        "ra_icrs",
+        "ra_hours",
+        "ra_h",
+        "rarad",
+        "ra_rad",
+    ),
+    "declination": (
+        "dec",
+        "dej2000",
+        "decj2000",
+        "dec_deg",
+        "de",
+        "declination",
+        "_dej2000",
+        "de_icrs",
+        "decrad",
+        "dec_rad",
+    ),
     "magnitude": ("v", "vmag", "mag", "magnitude", "phot_g_mean_mag"),
     "motion_right_ascension": ("pmra", "pm_ra"),
     "motion_declination": ("pmdec", "pm_dec", "pmde"),
@@ -57,8 +79,8 @@ class StarCatalogue:
         name: proper name or "" (n).
         right_ascension, declination: (n, rad), inertial axes of J2000/ICRS (they differ by 0.02 arcsec).
         magnitude: (n), V or what the file has in its place.
-        motion: proper motion (n x 2, rad per Julian year) in right ascension times cosine and in declination; zero where
-            the file has none.
+        motion: proper motion (n x 2, rad per Julian year) in right ascension times cosine and in declination; zero
+            where the file has none.
         skipped: records without a position or magnitude that were left out.
         source: the file.
     """
@@ -78,8 +100,8 @@ class StarCatalogue:
     def directions(self, years: float = 0.0) -> np.ndarray:
         """Unit vectors (n x 3) to the stars in inertial axes, ``years`` (Julian) after J2000.
 
-        Proper motion where the catalogue has it; aberration (20 arcsec at most) and parallax are not applied: they do not
-        matter to the choice of stars.
+        Proper motion where the catalogue has it; aberration (20 arcsec at most) and parallax are not applied: they do
+        not matter to the choice of stars.
         """
         ra, dec = self.right_ascension, self.declination
         radial = np.column_stack((np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)))
@@ -92,8 +114,16 @@ class StarCatalogue:
 
     def where(self, keep: np.ndarray) -> StarCatalogue:
         """The stars of a mask or of indices."""
-        return StarCatalogue(self.identifier[keep], self.name[keep], self.right_ascension[keep], self.declination[keep],
-                             self.magnitude[keep], self.motion[keep], self.skipped, self.source)
+        return StarCatalogue(
+            self.identifier[keep],
+            self.name[keep],
+            self.right_ascension[keep],
+            self.declination[keep],
+            self.magnitude[keep],
+            self.motion[keep],
+            self.skipped,
+            self.source,
+        )
 
     def brighter_than(self, magnitude: float) -> StarCatalogue:
         """The stars of this magnitude or brighter."""
@@ -124,28 +154,33 @@ def read_star_catalogue(path: str | os.PathLike[str], *, right_ascension_unit: s
         NotFiniteError: an infinite value.
     """
     if right_ascension_unit not in (None, "deg", "hour", "rad"):
-        raise RequestError("unknown unit", where="right_ascension_unit", value=right_ascension_unit, limit="deg, hour or rad")
+        raise RequestError(
+            "unknown unit", where="right_ascension_unit", value=right_ascension_unit, limit="deg, hour or rad"
+        )
     file = Path(path)
     try:
         text = file.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
-        raise FileFormatError("there is no such file", where=str(file), remedy="give the path of a star catalogue") from None
+        raise FileFormatError(
+            "there is no such file", where=str(file), remedy="give the path of a star catalogue"
+        ) from None
     except (OSError, UnicodeDecodeError) as error:
-        raise FileFormatError(f"the file cannot be read ({error})", where=str(file),
-                              remedy="a catalogue is a text file in UTF-8") from None
-    if text.lstrip()[:1] in ("[", "{"):
-        records = _json_records(text, file)
-    else:
-        records = _table_records(text, file)
-    return _catalogue(records, file, right_ascension_unit)
+        raise FileFormatError(
+            f"the file cannot be read ({error})", where=str(file), remedy="a catalogue is a text file in UTF-8"
+        ) from None
+    parse = _json_records if text.lstrip()[:1] in ("[", "{") else _table_records
+    return _catalogue(parse(text, file), file, right_ascension_unit)
 
 
 def _json_records(text: str, file: Path) -> list[Mapping[str, Any]]:
     try:
         content = json.loads(text)
     except json.JSONDecodeError as error:
-        raise FileFormatError(f"not valid JSON: {error.msg}", where=f"{file}, line {error.lineno}",
-                              remedy="the file may be truncated: fetch it again") from None
+        raise FileFormatError(
+            f"not valid JSON: {error.msg}",
+            where=f"{file}, line {error.lineno}",
+            remedy="the file may be truncated: fetch it again",
+        ) from None
     if isinstance(content, dict):
         lists = {k: v for k, v in content.items() if isinstance(v, list)}
         tables = [v for v in lists.values() if v and isinstance(v[0], dict)]
@@ -157,26 +192,40 @@ def _json_records(text: str, file: Path) -> list[Mapping[str, Any]]:
                 raise FileFormatError("the columns differ in length", where=str(file), value=sorted(lengths))
             content = [dict(zip(lists, row, strict=True)) for row in zip(*lists.values(), strict=True)]
     if not isinstance(content, list) or not all(isinstance(r, dict) for r in content):
-        raise FileFormatError("no list of star records", where=str(file),
-                              remedy='write [{"HR": "1", "RA": "00h 05m 09.9s", "Dec": "+45° 13′ 45″", "V": "6.70"}, ...]')
+        raise FileFormatError(
+            "no list of star records",
+            where=str(file),
+            remedy='write [{"HR": "1", "RA": "00h 05m 09.9s", "Dec": "+45° 13′ 45″", "V": "6.70"}, ...]',
+        )
     return content
 
 
 def _table_records(text: str, file: Path) -> list[Mapping[str, Any]]:
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if len(lines) < 2:
-        raise FileFormatError("no table with a header line", where=str(file), remedy="give columns such as id,ra,dec,mag")
+        raise FileFormatError(
+            "no table with a header line", where=str(file), remedy="give columns such as id,ra,dec,mag"
+        )
     delimiter = max(",;\t|", key=lines[0].count)
     if lines[0].count(delimiter) == 0:
-        raise FileFormatError("the header line has one column only", where=str(file), value=lines[0][:60],
-                              remedy="separate columns by commas, semicolons or tabs")
+        raise FileFormatError(
+            "the header line has one column only",
+            where=str(file),
+            value=lines[0][:60],
+            remedy="separate columns by commas, semicolons or tabs",
+        )
     rows = csv.reader(lines, delimiter=delimiter)
     header = [h.strip() for h in next(rows)]
-    records = []
+    records: list[Mapping[str, Any]] = []
     for number, row in enumerate(rows, start=2):
         if len(row) < len(header):
-            raise FileFormatError("a row is short", where=f"{file}, row {number}", value=f"{len(row)} columns",
-                                  limit=f"{len(header)} columns", remedy="the file may be truncated: fetch it again")
+            raise FileFormatError(
+                "a row is short",
+                where=f"{file}, row {number}",
+                value=f"{len(row)} columns",
+                limit=f"{len(header)} columns",
+                remedy="the file may be truncated: fetch it again",
+            )
         records.append(dict(zip(header, row, strict=False)))
     return records
 
@@ -202,8 +251,13 @@ def _catalogue(records: list[Mapping[str, Any]], file: Path, unit: str | None) -
     columns["identifier"] = _fullest_identifier(records, names)
     for kind in ("right_ascension", "declination", "magnitude"):
         if columns[kind] is None:
-            raise MissingDataError(f"no column of {kind.replace('_', ' ')}", where=str(file), value=", ".join(names[:12]),
-                                   limit=", ".join(_COLUMNS[kind]), remedy="rename the column")
+            raise MissingDataError(
+                f"no column of {kind.replace('_', ' ')}",
+                where=str(file),
+                value=", ".join(names[:12]),
+                limit=", ".join(_COLUMNS[kind]),
+                remedy="rename the column",
+            )
     identifiers, labels, places, magnitudes, motions = [], [], [], [], []
     decimal = skipped = 0
     for row, record in enumerate(records, start=1):
@@ -218,28 +272,55 @@ def _catalogue(records: list[Mapping[str, Any]], file: Path, unit: str | None) -
         dec = _angle(cells["declination"], columns["declination"] or "", None, hours=False, where=where)
         magnitude = _number(cells["magnitude"], f"{where}, {columns['magnitude']}")
         if not -1e-9 <= ra <= 2 * np.pi + 1e-9:
-            raise UnitError("a right ascension is out of range", where=where, value=cells["right_ascension"],
-                            limit="0 to 360 deg, 0 to 24 h", remedy="state the unit: right_ascension_unit")
+            raise UnitError(
+                "a right ascension is out of range",
+                where=where,
+                value=cells["right_ascension"],
+                limit="0 to 360 deg, 0 to 24 h",
+                remedy="state the unit: right_ascension_unit",
+            )
         if abs(dec) > np.pi / 2 + 1e-9:
-            raise UnitError("a declination is out of range", where=where, value=cells["declination"], limit="-90 to +90 deg")
+            raise UnitError(
+                "a declination is out of range", where=where, value=cells["declination"], limit="-90 to +90 deg"
+            )
         if not -30 < magnitude < 30:
             raise UnitError("a magnitude is out of range", where=where, value=magnitude, limit="-30 to 30")
         places.append((ra, dec))
         magnitudes.append(magnitude)
         identifiers.append(str(cells.get("identifier") or row))
         labels.append("" if _missing(cells.get("name")) else str(cells["name"]))
-        motions.append([0.0 if _missing(cells.get(k)) else _number(cells[k], where) * _MAS_PER_YEAR
-                        for k in ("motion_right_ascension", "motion_declination")])
+        motions.append(
+            [
+                0.0 if _missing(cells.get(k)) else _number(cells[k], where) * _MAS_PER_YEAR
+                for k in ("motion_right_ascension", "motion_declination")
+            ]
+        )
     if not places:
         raise MissingDataError("no star with a position and a magnitude", where=str(file), value=f"{skipped} records")
     position = np.array(places)
-    stated = unit is not None or (columns["right_ascension"] or "").lower() not in ("ra", "rightascension", "right_ascension")
+    stated = unit is not None or (columns["right_ascension"] or "").lower() not in (
+        "ra",
+        "rightascension",
+        "right_ascension",
+    )
     if not stated and decimal > 200 and np.degrees(position[:, 0].max()) <= 24:
-        raise UnitError("the right ascensions look like hours", where=str(file),
-                        value=f"largest of {decimal}: {np.degrees(position[:, 0].max()):.6g}", limit="360 deg",
-                        remedy='say right_ascension_unit="hour" (or "deg" if the field is that narrow)')
-    return StarCatalogue(np.array(identifiers), np.array(labels), position[:, 0], position[:, 1], np.array(magnitudes),
-                         np.array(motions), skipped, str(file))
+        raise UnitError(
+            "the right ascensions look like hours",
+            where=str(file),
+            value=f"largest of {decimal}: {np.degrees(position[:, 0].max()):.6g}",
+            limit="360 deg",
+            remedy='say right_ascension_unit="hour" (or "deg" if the field is that narrow)',
+        )
+    return StarCatalogue(
+        np.array(identifiers),
+        np.array(labels),
+        position[:, 0],
+        position[:, 1],
+        np.array(magnitudes),
+        np.array(motions),
+        skipped,
+        str(file),
+    )
 
 
 def _missing(value: Any) -> bool:
@@ -278,8 +359,12 @@ def _angle(value: Any, column: str, unit: str | None, *, hours: bool, where: str
     text = str(value).strip().replace("−", "-")
     parts = [float(x) for x in _NUMBERS.findall(text)]
     if not 2 <= len(parts) <= 3 or any(x >= 60 for x in parts[1:]) or "-" in text[1:]:
-        raise FileFormatError("not an angle", where=f"{where}, {column}", value=repr(value),
-                              remedy='write "00h 05m 09.9s" and "+45° 13′ 45″", or numbers in degrees')
+        raise FileFormatError(
+            "not an angle",
+            where=f"{where}, {column}",
+            value=repr(value),
+            remedy='write "00h 05m 09.9s" and "+45° 13′ 45″", or numbers in degrees',
+        )
     angle = sum(x / 60**k for k, x in enumerate(parts))
     if text.startswith("-"):
         angle = -angle

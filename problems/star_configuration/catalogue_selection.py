@@ -1,24 +1,25 @@
 """The best stars of the real sky: which of the visible stars to sight, proven best or with a stated gap.
 
-For an attitude, cameras and keep-out cones the candidates are the pairs (camera, star) that a camera can see. A choice S has the
-information ``F = sum over S of M_i`` and the criterion ``trace(A F^-1)`` (A = I for K0, I - V V^T for K1), which falls
-with every star added, so the best choice fills the quotas: ``count`` in all and a number per camera.
+For an attitude, cameras and keep-out cones the candidates are the pairs (camera, star) that a camera can see. A choice
+S has the information ``F = sum over S of M_i`` and the criterion ``trace(A F^-1)`` (A = I for K0, I - V V^T for K1),
+which falls with every star added, so the best choice fills the quotas: ``count`` in all and a number per camera.
 
-Lower bound. Let the choice be fractional, ``0 <= x_i <= 1``: the criterion is convex in ``F``, and at ANY positive definite
-``F`` its tangent gives
+Lower bound. Let the choice be fractional, ``0 <= x_i <= 1``: the criterion is convex in ``F``, and at ANY positive
+definite ``F`` its tangent gives
 
     trace(A F'^-1) >= 2 trace(A F^-1) - sum over S' of s_i,   s_i = trace(F^-1 A F^-1 M_i)
 
 for every choice S' with information F'. The right side is least for the choice with the greatest scores s_i, which
-sorting finds (the quotas are a laminar matroid, on which greedy sorting is exact). The bound holds without the relaxation being
-solved exactly; solving it by an interior-point method (rank-6 structure: a few small matrices per step) makes it tight.
+sorting finds (the quotas are a laminar matroid, on which greedy sorting is exact). The bound holds without the
+relaxation being solved exactly; solving it by an interior-point method (rank-6 structure: a few small matrices per
+step) makes it tight.
 
 Upper bound. The relaxation rounded and a greedy choice, both improved by exchanges (Fedorov): the best single
 exchange is made until none helps.
 
-Proof. A candidate whose forced presence or absence lifts the lower bound above the upper bound is settled. What is left is
-enumerated if it has few subsets, else branched on (best bound first). If ``node_limit`` stops that, the gap between the
-bounds is reported instead.
+Proof. A candidate whose forced presence or absence lifts the lower bound above the upper bound is settled. What is
+left is enumerated if it has few subsets, else branched on (best bound first). If ``node_limit`` stops that, the gap
+between the bounds is reported instead.
 """
 
 from __future__ import annotations
@@ -62,8 +63,8 @@ class Camera:
         magnitude_limit: the faintest star it follows.
         stars: the most stars it follows at once; None for no limit of its own.
         sigma: total accuracy of a direction (rad, or 1 to have the criteria in units of its square).
-        photon_sigma: total accuracy (unit of ``sigma``) that photon noise alone leaves at ``photon_magnitude``; it grows
-            as the root of the flux falls: ``sigma_total^2 = sigma^2 + photon_sigma^2 10^(0.4 (m - photon_magnitude))``.
+        photon_sigma: total accuracy (unit of ``sigma``) that photon noise alone leaves at ``photon_magnitude``; it
+            grows as the flux falls: ``sigma_total^2 = sigma^2 + photon_sigma^2 10^(0.4 (m - photon_magnitude))``.
         ratio: accuracy along the first measuring axis over that along the second (1: equal).
         first_axis: the first measuring axis (3), body axes, used where ``ratio`` is not 1.
         name: its name.
@@ -86,8 +87,13 @@ class Camera:
             unit = unit_vectors(getattr(self, name), f"{where}, {name}")[0]
             object.__setattr__(self, name, tuple(float(x) for x in unit))
         if not 0 < self.half_angle <= np.pi:
-            raise RequestError("the half-angle of a field of view is out of range", where=where,
-                               value=f"{self.half_angle} rad", limit="0 to pi", remedy="give it in radians")
+            raise RequestError(
+                "the half-angle of a field of view is out of range",
+                where=where,
+                value=f"{self.half_angle} rad",
+                limit="0 to pi",
+                remedy="give it in radians",
+            )
         if not (np.isfinite(self.sigma) and self.sigma > 0 and self.ratio > 0 and self.photon_sigma >= 0):
             raise RequestError("an accuracy is not a positive number", where=where, value=self.sigma, limit="above 0")
         if self.stars is not None and self.stars < 1:
@@ -129,7 +135,8 @@ class Selection:
         why: the sentence: what was proven.
         chosen: indices into the candidates, ascending; ``candidates`` are these.
         criteria: K0, K1 and covariance of the choice (body axes).
-        value: the criterion minimised; ``lower_bound``: no choice has less; ``gap``: (value - lower_bound) / lower_bound.
+        value: the criterion minimised; ``lower_bound``: no choice has less; ``gap``: (value - lower_bound) /
+            lower_bound.
         proven: the choice is optimal (to 1e-10 of its value).
         nodes: branches looked at; 0 where enumeration or the first bound was enough.
         seconds: time taken.
@@ -160,8 +167,13 @@ def attitude(quaternion: Any) -> Rotation:
     if q.shape != (4,) or not np.all(np.isfinite(q)):
         raise QuaternionError("an attitude is four finite numbers w x y z", where="attitude", value=quaternion)
     if abs(np.linalg.norm(q) - 1) > 1e-3:
-        raise QuaternionError("the quaternion is not of unit length", where="attitude", value=f"{np.linalg.norm(q):.6g}",
-                              limit="1 within 1e-3", remedy="normalise it, and check the order: scalar first")
+        raise QuaternionError(
+            "the quaternion is not of unit length",
+            where="attitude",
+            value=f"{np.linalg.norm(q):.6g}",
+            limit="1 within 1e-3",
+            remedy="normalise it, and check the order: scalar first",
+        )
     return Rotation.from_quat(q, scalar_first=True)
 
 
@@ -179,8 +191,9 @@ class Sky:
         self.magnitude = catalogue.magnitude[self.order]
         self.inertial = catalogue.directions(years)[self.order]
 
-    def candidates(self, inertial_from_body: Any, cameras: Sequence[Camera],
-                   keep_outs: Sequence[KeepOut] = ()) -> Candidates:
+    def candidates(
+        self, inertial_from_body: Any, cameras: Sequence[Camera], keep_outs: Sequence[KeepOut] = ()
+    ) -> Candidates:
         """What the cameras can sight at an attitude.
 
         Args:
@@ -194,13 +207,16 @@ class Sky:
         parts = []
         for index, camera in enumerate(cameras):
             bright = int(np.searchsorted(self.magnitude, camera.magnitude_limit, side="right"))
-            seen = np.flatnonzero(self.inertial[:bright] @ (rotation @ np.array(camera.boresight))
-                                  >= np.cos(camera.half_angle))
+            seen = np.flatnonzero(
+                self.inertial[:bright] @ (rotation @ np.array(camera.boresight)) >= np.cos(camera.half_angle)
+            )
             for cone in keep_outs:
                 seen = seen[self.inertial[seen] @ np.array(cone.direction) <= np.cos(cone.half_angle)]
             body = self.inertial[seen] @ rotation
             sigma = camera.accuracy(self.magnitude[seen])
-            parts.append((body, _sighting_information(body, sigma, camera), np.full(len(seen), index), self.order[seen], sigma))
+            parts.append(
+                (body, _sighting_information(body, sigma, camera), np.full(len(seen), index), self.order[seen], sigma)
+            )
         columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
         quotas = tuple(camera.stars if camera.stars is not None else len(self.order) for camera in cameras)
         return Candidates(columns[0], columns[1], columns[2], columns[3], columns[4], quotas)
@@ -216,14 +232,23 @@ def _sighting_information(directions: np.ndarray, sigma: np.ndarray, camera: Cam
     first = axis - (directions @ axis)[:, None] * directions
     length = np.linalg.norm(first, axis=1)
     if np.any(length < 1e-6):
-        raise RequestError("the first measuring axis lies along a line of sight", where=f"camera {camera.name}, first_axis",
-                           value=camera.first_axis, remedy="choose it across the boresight")
+        raise RequestError(
+            "the first measuring axis lies along a line of sight",
+            where=f"camera {camera.name}, first_axis",
+            value=camera.first_axis,
+            remedy="choose it across the boresight",
+        )
     first /= length[:, None]
     second = np.cross(directions, first)
     sigma_second = sigma / np.sqrt(1 + camera.ratio**2)
     sigma_first = camera.ratio * sigma_second
-    return np.stack([first[:, i] * first[:, j] / sigma_second**2 + second[:, i] * second[:, j] / sigma_first**2
-                     for i, j in _SYMMETRIC], axis=1)
+    return np.stack(
+        [
+            first[:, i] * first[:, j] / sigma_second**2 + second[:, i] * second[:, j] / sigma_first**2
+            for i, j in _SYMMETRIC
+        ],
+        axis=1,
+    )
 
 
 def criterion_values(information: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -239,8 +264,9 @@ def criterion_values(information: np.ndarray, weight: np.ndarray) -> np.ndarray:
     cxx, cyy, czz = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
     cyz, cxz, cxy = xz * xy - xx * yz, xy * yz - yy * xz, xz * yz - zz * xy
     determinant = xx * cxx + xy * cxy + xz * cxz
-    top = (weight[0] * cxx + weight[1] * cyy + weight[2] * czz
-           + 2 * (weight[3] * cyz + weight[4] * cxz + weight[5] * cxy))
+    top = (
+        weight[0] * cxx + weight[1] * cyy + weight[2] * czz + 2 * (weight[3] * cyz + weight[4] * cxz + weight[5] * cxy)
+    )
     small = 1e-13 * ((xx + yy + zz) / 3) ** 3
     good = determinant > small
     return np.where(good, top / np.where(good, determinant, 1.0), np.inf)
@@ -260,8 +286,15 @@ def _entries(matrix: np.ndarray) -> np.ndarray:
 class _Problem:
     """Choose ``count`` of the free candidates beside those already in, within the quotas."""
 
-    def __init__(self, information: np.ndarray, camera: np.ndarray, quotas: np.ndarray, count: int,
-                 base: np.ndarray, weight: np.ndarray):
+    def __init__(
+        self,
+        information: np.ndarray,
+        camera: np.ndarray,
+        quotas: np.ndarray,
+        count: int,
+        base: np.ndarray,
+        weight: np.ndarray,
+    ):
         self.information, self.camera, self.quotas = information, camera, quotas
         self.base, self.weight = base, weight
         available = np.minimum(np.bincount(camera, minlength=len(quotas)), quotas)
@@ -353,7 +386,7 @@ def _relaxation(problem: _Problem, target: float) -> tuple[float, np.ndarray, np
     forced = np.zeros(len(problem.camera), dtype=bool) if inequality else (sizes <= problem.quotas)[problem.camera]
     m, camera = problem.information[~forced], problem.camera[~forced]
     base = problem.base + problem.information[forced].sum(axis=0)
-    n, k = len(m), problem.count - int(forced.sum())
+    n = len(m)
     binding = [c for c in range(len(room)) if sizes[c] > problem.quotas[c]]
     rows = np.array([camera == c for c in binding], dtype=float).reshape(-1, n)
     # Without a choice between cameras each quota is filled exactly; else the total is, and the quotas are caps.
@@ -432,7 +465,9 @@ def _curvature(inverse: np.ndarray, middle: np.ndarray) -> np.ndarray:
     return half + half.T
 
 
-def _settled(problem: _Problem, bound: float, chosen: np.ndarray, scores: np.ndarray, upper: float) -> tuple[np.ndarray, np.ndarray]:
+def _settled(
+    problem: _Problem, bound: float, chosen: np.ndarray, scores: np.ndarray, upper: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Masks of candidates that must be in and that must be out of any choice better than ``upper``.
 
     The tangent bound with candidate i forced in is the bound plus what the sum of scores loses: i takes the place of
@@ -478,8 +513,15 @@ def _enumerate(problem: _Problem) -> tuple[float, np.ndarray]:
     return float(values[k]), np.flatnonzero(table[k])
 
 
-def select(candidates: Candidates, count: int, *, criterion: str = "K0", axis: Any = (0.0, 0.0, 1.0),
-           exact: bool = True, node_limit: int = 400) -> Selection:
+def select(
+    candidates: Candidates,
+    count: int,
+    *,
+    criterion: str = "K0",
+    axis: Any = (0.0, 0.0, 1.0),
+    exact: bool = True,
+    node_limit: int = 400,
+) -> Selection:
     """Choose the stars to sight.
 
     Args:
@@ -499,35 +541,66 @@ def select(candidates: Candidates, count: int, *, criterion: str = "K0", axis: A
         raise RequestError("the number of stars is out of range", where="count", value=count, limit="1 or more")
     v = unit_vectors(axis, "axis")[0]
     weight = _entries(np.eye(3) - (np.outer(v, v) if criterion == "K1" else 0.0))
-    problem = _Problem(candidates.information, candidates.camera, np.array(candidates.quotas, dtype=int), count, np.zeros(6), weight)
+    problem = _Problem(
+        candidates.information, candidates.camera, np.array(candidates.quotas, dtype=int), count, np.zeros(6), weight
+    )
 
     def answer(status: str, why: str, chosen: np.ndarray, lower: float, proven: bool, nodes: int) -> Selection:
         chosen = np.sort(chosen)
         total = candidates.information[chosen].sum(axis=0) if len(chosen) else np.zeros(6)
-        found = criteria_of_information(_matrix(total), v) if len(chosen) else Criteria(np.inf, np.inf, v, None, np.eye(3))
+        found = (
+            criteria_of_information(_matrix(total), v) if len(chosen) else Criteria(np.inf, np.inf, v, None, np.eye(3))
+        )
         value = found.K0 if criterion == "K0" else found.K1
         lower = value if proven else min(lower, value)
         gap = 0.0 if proven else (value / lower - 1 if lower > 0 else np.inf)
-        return Selection(status, why, chosen, candidates, found, value, lower, gap, proven, nodes, time.perf_counter() - began)
+        return Selection(
+            status, why, chosen, candidates, found, value, lower, gap, proven, nodes, time.perf_counter() - began
+        )
 
     if len(candidates) < 2 or problem.count < 2:
         seen = f"{len(candidates)} star{'' if len(candidates) == 1 else 's'} can be sighted and {count} asked for"
-        return answer("unobservable", f"{seen}: two stars are needed for an attitude; widen the field of view, raise the "
-                      "magnitude limit or turn away from the keep-out cones", np.arange(min(len(candidates), problem.count)),
-                      0.0, False, 0)
+        return answer(
+            "unobservable",
+            f"{seen}: two stars are needed for an attitude; widen the field of view, raise the "
+            "magnitude limit or turn away from the keep-out cones",
+            np.arange(min(len(candidates), problem.count)),
+            0.0,
+            False,
+            0,
+        )
     if problem.count == len(candidates):
-        result = answer("ok", f"all {len(candidates)} visible stars are sighted: fewer are visible than asked for"
-                        if len(candidates) < count else f"all {len(candidates)} visible stars are sighted",
-                        np.arange(len(candidates)), 0.0, True, 0)
+        result = answer(
+            "ok",
+            f"all {len(candidates)} visible stars are sighted: fewer are visible than asked for"
+            if len(candidates) < count
+            else f"all {len(candidates)} visible stars are sighted",
+            np.arange(len(candidates)),
+            0.0,
+            True,
+            0,
+        )
     elif comb(len(candidates), problem.count) <= _ENUMERATED:
         _, chosen = _enumerate(problem)
-        result = answer("ok", f"best of all {comb(len(candidates), problem.count)} subsets of {len(candidates)} visible stars",
-                        chosen, 0.0, True, 0)
+        result = answer(
+            "ok",
+            f"best of all {comb(len(candidates), problem.count)} subsets of {len(candidates)} visible stars",
+            chosen,
+            0.0,
+            True,
+            0,
+        )
     else:
         result = _search(problem, answer, exact, node_limit)
     if result.criteria.covariance is None:
-        return answer("unobservable", "the stars that can be sighted lie along one line: the rotation about it is not seen",
-                      result.chosen, 0.0, False, result.nodes)
+        return answer(
+            "unobservable",
+            "the stars that can be sighted lie along one line: the rotation about it is not seen",
+            result.chosen,
+            0.0,
+            False,
+            result.nodes,
+        )
     return result
 
 
@@ -543,8 +616,14 @@ def _search(problem: _Problem, answer: Any, exact: bool, node_limit: int) -> Sel
     incumbent = first
     if not exact:
         gap = max(upper / bound - 1, 0.0)
-        return answer("ok", f"greedy and exchange among {n} visible stars; at most {100 * gap:.3g} % above the optimum", incumbent,
-                      bound, gap <= _SAME, 0)
+        return answer(
+            "ok",
+            f"greedy and exchange among {n} visible stars; at most {100 * gap:.3g} % above the optimum",
+            incumbent,
+            bound,
+            gap <= _SAME,
+            0,
+        )
     # A node: its bound, and the masks of what is in and out. The heap holds the open ones, lowest bound first.
     everything = np.arange(n)
     heap: list[tuple[float, int, np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray] | None]] = []
@@ -582,9 +661,13 @@ def _search(problem: _Problem, answer: Any, exact: bool, node_limit: int) -> Sel
                 inside[free[must_in]] = True
                 outside[free[must_out]] = True
                 # Settling a few does not change the relaxation enough to solve it again before branching.
-                if np.sum(must_in) + np.sum(must_out) >= max(2, len(free) // 8) or \
-                        comb(len(free) - int(must_in.sum()) - int(must_out.sum()), max(part.count - int(must_in.sum()), 0)) \
-                        <= _ENUMERATED:
+                if (
+                    np.sum(must_in) + np.sum(must_out) >= max(2, len(free) // 8)
+                    or comb(
+                        len(free) - int(must_in.sum()) - int(must_out.sum()), max(part.count - int(must_in.sum()), 0)
+                    )
+                    <= _ENUMERATED
+                ):
                     continue
                 part_fractions = np.where(must_in | must_out, -1.0, part_fractions)
             branch = int(free[int(np.argmin(np.abs(part_fractions - 0.5)))])
@@ -597,8 +680,12 @@ def _search(problem: _Problem, answer: Any, exact: bool, node_limit: int) -> Sel
     lower = min(heap[0][0], upper) if heap else upper
     proven = lower >= upper * (1 - _SAME)
     gap = 0.0 if proven else upper / lower - 1
-    why = (f"proven best among {n} visible stars" if proven
-           else f"at most {100 * gap:.3g} % above the optimum among {n} visible stars (the proof stopped at {nodes} branches)")
+    why = (
+        f"proven best among {n} visible stars"
+        if proven
+        else f"at most {100 * gap:.3g} % above the optimum among {n} visible stars "
+        f"(the proof stopped at {nodes} branches)"
+    )
     return answer("ok", why, incumbent, lower, proven, nodes)
 
 
@@ -609,8 +696,14 @@ def _part(problem: _Problem, inside: np.ndarray, free: np.ndarray) -> _Problem |
     left = problem.count - int(inside.sum())
     if np.any(quotas < 0) or left < 0:
         return None
-    part = _Problem(problem.information[free], problem.camera[free], quotas, left,
-                    problem.base + problem.information[inside].sum(axis=0), problem.weight)
+    part = _Problem(
+        problem.information[free],
+        problem.camera[free],
+        quotas,
+        left,
+        problem.base + problem.information[inside].sum(axis=0),
+        problem.weight,
+    )
     return part if part.count == left else None
 
 

@@ -1,7 +1,7 @@
 """The published formulas of Sukhovilov (2007), as an independent computation in NumPy: no matrix is inverted here.
 
-All in units of ``sigma^2`` with ``sigma`` the total standard deviation of a direction (see criteria.py). The scan of the
-paper is damaged; the formulas below are the ones that agree with the matrix form (3) to rounding:
+All in units of ``sigma^2`` with ``sigma`` the total standard deviation of a direction (see criteria.py). The scan of
+the paper is damaged; the formulas below are the ones that agree with the matrix form (3) to rounding:
 
     (8)   K0 = (1/2) (1/2 + 2 / (1 - c^2))                                             two directions
     (11)  K0 = (1/2) (12 - s) / (8 - 2 s - 2 c12 c13 c23),  s = c12^2 + c13^2 + c23^2    three directions
@@ -13,9 +13,9 @@ paper is damaged; the formulas below are the ones that agree with the matrix for
     (19)  min over V of K1 = trace P - (1/2) / xi3,  xi3 the least eigenvalue of f = N I - B B^T
     (20)  xi = (N + D1, N + D2, D3),  D1 + D2 + D3 = 0,  D3 > 0: directions near the axis
 
-Corrections to the text: the least K0 is 9 / (4 N) for N >= 3 only, at N = 2 it is 5/4; the bound for two directions is on
-``|c|``, the best axis is the SUM bisector for c > 0 and the DIFFERENCE bisector for c < 0; (19) for two directions is
-``(1/2) (1/2 + 1 / (1 + |c|))``; the limit ``sigma^2 / N`` of K1 is an infimum that no configuration attains with a
+Corrections to the text: the least K0 is 9 / (4 N) for N >= 3 only, at N = 2 it is 5/4; the bound for two directions is
+on ``|c|``, the best axis is the SUM bisector for c > 0 and the DIFFERENCE bisector for c < 0; (19) for two directions
+is ``(1/2) (1/2 + 1 / (1 + |c|))``; the limit ``sigma^2 / N`` of K1 is an infimum that no configuration attains with a
 determined attitude.
 """
 
@@ -32,12 +32,15 @@ PUBLISHED_TABLE: dict[int, tuple[tuple[float, ...], tuple[float, ...]]] = {
     5: ((0, 0, 125.02, 28.558, 74.875), (0, 66.549, 90.484, 131.53, 254.8)),
     6: ((0, 0, 95.822, 44.059, 88.033, 0), (0, 90.299, 77.271, 159.42, 269.14, 74.134)),
     7: ((0, 0, 120.83, 39.022, 90.837, -0.002, 69.135), (0, 94.767, 75.248, 141.47, 290.72, 61.399, 57.085)),
-    8: ((0, 0, 129.15, 25.322, 94.901, 0, 52.939, 77.674),
-        (0, 54.722, 91.954, 106.81, 280.78, 117.26, 10.54, 78.911)),
-    9: ((0, 0, 121.49, 122.2, 77.072, 0, 10.429, 56.201, 53.911),
-        (0, 98.15, 105.21, 112.76, 282.17, 108.32, -26.298, 55.796, 45.085)),
-    10: ((0, 0, 133.62, 157.45, 43.587, -0.018, -53.68, 60.277, 71.009, 95.382),
-         (0, 135.69, 116.13, 117.58, 294.92, 115.1, 54.842, 65.609, 73.114, 46.774)),
+    8: ((0, 0, 129.15, 25.322, 94.901, 0, 52.939, 77.674), (0, 54.722, 91.954, 106.81, 280.78, 117.26, 10.54, 78.911)),
+    9: (
+        (0, 0, 121.49, 122.2, 77.072, 0, 10.429, 56.201, 53.911),
+        (0, 98.15, 105.21, 112.76, 282.17, 108.32, -26.298, 55.796, 45.085),
+    ),
+    10: (
+        (0, 0, 133.62, 157.45, 43.587, -0.018, -53.68, 60.277, 71.009, 95.382),
+        (0, 135.69, 116.13, 117.58, 294.92, 115.1, 54.842, 65.609, 73.114, 46.774),
+    ),
 }
 """The published configurations: for each N the two angles (deg). They are called latitude and longitude there and are
 in fact azimuth (first) and polar angle (second): only so does each row attain the minimum."""
@@ -164,9 +167,9 @@ def least_K0_unequal(sigmas: np.ndarray) -> float:
 def least_K0_beside_fixed(fixed: np.ndarray, count: int) -> float:
     """Least K0 when ``count`` equal directions join ``fixed`` ones (m x 3): by filling the poorest axes first.
 
-    Any positive semidefinite matrix of trace ``count`` and rank up to ``count`` is a sum of ``count`` projections on unit
-    vectors, so the added moments pour like water into the eigenvalues of the fixed moments until the level is even.
-    For ``count`` below the number of axes that the water reaches the value is a lower bound.
+    Any positive semidefinite matrix of trace ``count`` and rank up to ``count`` is a sum of ``count`` projections on
+    unit vectors, so the added moments pour like water into the eigenvalues of the fixed moments until the level is
+    even. For ``count`` below the number of axes that the water reaches the value is a lower bound.
     """
     moments = np.sort(np.linalg.eigvalsh(fixed.T @ fixed)) if len(fixed) else np.zeros(3)
     total = len(fixed) + count

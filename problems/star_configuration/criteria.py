@@ -18,9 +18,9 @@ K1 is the second moment of the length of the error of the unit vector ``V``, not
 
 Relation to Wahba's problem: with weights ``1 / sigma_i^2`` the minimiser of Wahba's loss (QUEST, SVD, q-method) is the
 maximum-likelihood attitude for isotropic direction errors, and its covariance by Shuster and Oh (1981),
-``P = s^2 (I - sum a_i w_i w_i^T)^-1`` with ``1/s^2 = sum 1/s_i^2`` and ``a_i = s^2/s_i^2`` (``s_i`` per axis), is the same
-matrix. With two-axis accuracies Wahba's weights are not optimal, and ``P`` here is the covariance of weighted least
-squares (the Cramer-Rao bound), which Wahba's solution does not reach.
+``P = s^2 (I - sum a_i w_i w_i^T)^-1`` with ``1/s^2 = sum 1/s_i^2`` and ``a_i = s^2/s_i^2`` (``s_i`` per axis), is the
+same matrix. With two-axis accuracies Wahba's weights are not optimal, and ``P`` here is the covariance of weighted
+least squares (the Cramer-Rao bound), which Wahba's solution does not reach.
 
 Shapes: directions (3 x N), one unit vector a column; sigmas (N) or a scalar. Every function takes and returns CasADi
 matrices (SX, MX, DM) or NumPy arrays that CasADi accepts.
@@ -62,7 +62,8 @@ def two_axis_information(direction: Matrix, first_axis: Matrix, sigma_first: Mat
 def information(directions: Matrix, sigma: Matrix = 1.0) -> Matrix:
     """Information (3 x 3, 1/rad^2) of all directions (3 x N); ``sigma`` (rad, total) is a scalar or has N entries."""
     count = directions.shape[1]
-    weight = 2 / ca.reshape(sigma, 1, -1) ** 2
+    row: Matrix = ca.reshape(sigma, 1, -1)
+    weight = 2 / row**2
     if weight.shape[1] == 1:
         weight = ca.repmat(weight, 1, count)
     weighted = directions * ca.repmat(weight, 3, 1)
@@ -154,8 +155,13 @@ def unit_vectors(directions: Any, where: str = "directions") -> np.ndarray:
         raise NotFiniteError("a direction is not a finite vector", where=where, remedy="give three numbers for each")
     length = np.linalg.norm(rows, axis=1)
     if np.any(length < 1e-12):
-        raise RequestError("a direction has length zero", where=f"{where}[{int(np.argmin(length))}]",
-                           value=float(length.min()), limit="above 0", remedy="give a vector that points somewhere")
+        raise RequestError(
+            "a direction has length zero",
+            where=f"{where}[{int(np.argmin(length))}]",
+            value=float(length.min()),
+            limit="above 0",
+            remedy="give a vector that points somewhere",
+        )
     return rows / length[:, None]
 
 

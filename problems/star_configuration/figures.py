@@ -1,7 +1,7 @@
 """The sphere of directions: an interactive page that needs no network, and pictures for a report.
 
-Angles are drawn true on the unit sphere of body axes. The ellipsoid at the centre is the attitude covariance: its half-axes are
-proportional to the standard deviations about the body axes, scaled to fit.
+Angles are drawn true on the unit sphere of body axes. The ellipsoid at the centre is the attitude covariance: its
+half-axes are proportional to the standard deviations about the body axes, scaled to fit.
 """
 
 from __future__ import annotations
@@ -49,54 +49,127 @@ def sphere_page(configuration: Configuration, path: str | os.PathLike[str]) -> N
         path: where to write.
     """
     request = configuration.request
-    title = (f"{request.count} star directions, best for {request.criterion}: "
-             f"K0 = {configuration.K0:.6g}, K1 = {configuration.K1:.6g} (sigma = 1)")
+    title = (
+        f"{request.count} star directions, best for {request.criterion}: "
+        f"K0 = {configuration.K0:.6g}, K1 = {configuration.K1:.6g} (sigma = 1)"
+    )
     labels = [f"sensor {i + 1}" for i in range(len(configuration.directions))]
-    _write_sphere(path, title, configuration.directions, labels, np.array(request.fixed).reshape(-1, 3), request.keep_outs, (),
-                  configuration.axis, configuration.covariance, None)
+    _write_sphere(
+        path,
+        title,
+        configuration.directions,
+        labels,
+        np.array(request.fixed).reshape(-1, 3),
+        request.keep_outs,
+        (),
+        configuration.axis,
+        configuration.covariance,
+        None,
+    )
 
 
 def sky_page(selection: Selection, catalogue: Any, cameras: Sequence[Camera], path: str | os.PathLike[str]) -> None:
     """Write an interactive page (HTML, self-contained) of the chosen stars among the visible ones, body axes."""
     candidates = selection.candidates
     chosen = selection.chosen
-    labels = [f"{catalogue.name[s] or catalogue.identifier[s]}, magnitude {catalogue.magnitude[s]:.2f}, {cameras[c].name}"
-              for s, c in zip(candidates.star[chosen], candidates.camera[chosen], strict=True)]
-    title = (f"{len(chosen)} of {len(candidates)} visible stars: K0 = {selection.criteria.K0:.6g}, "
-             f"K1 = {selection.criteria.K1:.6g} (sigma = 1); {selection.why}")
-    _write_sphere(path, title, candidates.directions[chosen], labels, np.zeros((0, 3)), (),
-                  [(camera.boresight, camera.half_angle, camera.name) for camera in cameras], selection.criteria.axis,
-                  selection.criteria.covariance, candidates.directions)
+    labels = [
+        f"{catalogue.name[s] or catalogue.identifier[s]}, magnitude {catalogue.magnitude[s]:.2f}, {cameras[c].name}"
+        for s, c in zip(candidates.star[chosen], candidates.camera[chosen], strict=True)
+    ]
+    title = (
+        f"{len(chosen)} of {len(candidates)} visible stars: K0 = {selection.criteria.K0:.6g}, "
+        f"K1 = {selection.criteria.K1:.6g} (sigma = 1); {selection.why}"
+    )
+    _write_sphere(
+        path,
+        title,
+        candidates.directions[chosen],
+        labels,
+        np.zeros((0, 3)),
+        (),
+        [(camera.boresight, camera.half_angle, camera.name) for camera in cameras],
+        selection.criteria.axis,
+        selection.criteria.covariance,
+        candidates.directions,
+    )
 
 
-def _write_sphere(path: str | os.PathLike[str], title: str, directions: np.ndarray, labels: list[str], fixed: np.ndarray,
-                  cones: Sequence[KeepOut], fields: Sequence[tuple[Any, float, str]], axis: np.ndarray,
-                  covariance: np.ndarray | None, others: np.ndarray | None) -> None:
+def _write_sphere(
+    path: str | os.PathLike[str],
+    title: str,
+    directions: np.ndarray,
+    labels: list[str],
+    fixed: np.ndarray,
+    cones: Sequence[KeepOut],
+    fields: Sequence[tuple[Any, float, str]],
+    axis: np.ndarray,
+    covariance: np.ndarray | None,
+    others: np.ndarray | None,
+) -> None:
     import plotly.graph_objects as go
 
     u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 61), np.linspace(0, np.pi, 31))
-    traces: list[Any] = [go.Surface(x=0.995 * np.cos(u) * np.sin(v), y=0.995 * np.sin(u) * np.sin(v), z=0.995 * np.cos(v),
-                                    opacity=0.12, showscale=False, colorscale=[[0, _MUTED], [1, _MUTED]], hoverinfo="skip")]
+    traces: list[Any] = [
+        go.Surface(
+            x=0.995 * np.cos(u) * np.sin(v),
+            y=0.995 * np.sin(u) * np.sin(v),
+            z=0.995 * np.cos(v),
+            opacity=0.12,
+            showscale=False,
+            colorscale=[[0, _MUTED], [1, _MUTED]],
+            hoverinfo="skip",
+        )
+    ]
     for angle in range(-60, 90, 30):
         ring = circle((0, 0, 1), np.radians(90 - angle))
         traces.append(_line(go, ring, _MUTED, 1, ""))
     for axis_name, end in zip("xyz", np.eye(3), strict=True):
         traces.append(_line(go, np.array([[0, 0, 0], 1.2 * end]), _MUTED, 2, ""))
-        traces.append(go.Scatter3d(x=[1.26 * end[0]], y=[1.26 * end[1]], z=[1.26 * end[2]], mode="text", text=[axis_name],
-                                   textfont={"color": _INK, "size": 14}, hoverinfo="skip", showlegend=False))
+        traces.append(
+            go.Scatter3d(
+                x=[1.26 * end[0]],
+                y=[1.26 * end[1]],
+                z=[1.26 * end[2]],
+                mode="text",
+                text=[axis_name],
+                textfont={"color": _INK, "size": 14},
+                hoverinfo="skip",
+                showlegend=False,
+            )
+        )
     if others is not None:
-        traces.append(go.Scatter3d(x=others[:, 0], y=others[:, 1], z=others[:, 2], mode="markers", name="visible",
-                                   marker={"size": 3, "color": _MUTED}, hoverinfo="skip"))
-    for rows, color, name, words in ((directions, _STAR, "sighted", labels),
-                                     (fixed, _FIXED, "on board", [f"on board {i + 1}" for i in range(len(fixed))])):
+        traces.append(
+            go.Scatter3d(
+                x=others[:, 0],
+                y=others[:, 1],
+                z=others[:, 2],
+                mode="markers",
+                name="visible",
+                marker={"size": 3, "color": _MUTED},
+                hoverinfo="skip",
+            )
+        )
+    for rows, color, name, words in (
+        (directions, _STAR, "sighted", labels),
+        (fixed, _FIXED, "on board", [f"on board {i + 1}" for i in range(len(fixed))]),
+    ):
         if len(rows) == 0:
             continue
         spokes = np.full((3 * len(rows), 3), np.nan)
         spokes[0::3], spokes[1::3] = 0.0, rows
         traces.append(_line(go, spokes, color, 4, ""))
-        traces.append(go.Scatter3d(x=rows[:, 0], y=rows[:, 1], z=rows[:, 2], mode="markers", name=name, text=words,
-                                   marker={"size": 6, "color": color},
-                                   hovertemplate="%{text}<br>(%{x:.5f}, %{y:.5f}, %{z:.5f})<extra></extra>"))
+        traces.append(
+            go.Scatter3d(
+                x=rows[:, 0],
+                y=rows[:, 1],
+                z=rows[:, 2],
+                mode="markers",
+                name=name,
+                text=words,
+                marker={"size": 6, "color": color},
+                hovertemplate="%{text}<br>(%{x:.5f}, %{y:.5f}, %{z:.5f})<extra></extra>",
+            )
+        )
     for cone in cones:
         traces.append(_line(go, circle(cone.direction, cone.half_angle), _CONE, 4, f"keep out: {cone.name}"))
     for centre, half_angle, name in fields:
@@ -104,22 +177,49 @@ def _write_sphere(path: str | os.PathLike[str], title: str, directions: np.ndarr
     traces.append(_line(go, np.array([-1.15 * axis, 1.15 * axis]), _AXIS, 5, "axis of K1", dash="dash"))
     if covariance is not None:
         x, y, z = _ellipsoid(covariance)
-        traces.append(go.Surface(x=x, y=y, z=z, opacity=0.45, showscale=False, colorscale=[[0, _AXIS], [1, _AXIS]],
-                                 name="attitude error", hovertemplate="attitude error, one sigma, scaled<extra></extra>"))
+        traces.append(
+            go.Surface(
+                x=x,
+                y=y,
+                z=z,
+                opacity=0.45,
+                showscale=False,
+                colorscale=[[0, _AXIS], [1, _AXIS]],
+                name="attitude error",
+                hovertemplate="attitude error, one sigma, scaled<extra></extra>",
+            )
+        )
     hidden = {"visible": False}
     figure = go.Figure(traces)
-    figure.update_layout(title={"text": title, "font": {"size": 15, "color": _INK}}, paper_bgcolor="white",
-                         scene={"xaxis": hidden, "yaxis": hidden, "zaxis": hidden, "aspectmode": "cube",
-                                "camera": {"eye": {"x": 0.95, "y": 0.8, "z": 0.55}}},
-                         legend={"x": 0.01, "y": 0.95}, margin={"l": 0, "r": 0, "t": 60, "b": 0})
+    figure.update_layout(
+        title={"text": title, "font": {"size": 15, "color": _INK}},
+        paper_bgcolor="white",
+        scene={
+            "xaxis": hidden,
+            "yaxis": hidden,
+            "zaxis": hidden,
+            "aspectmode": "cube",
+            "camera": {"eye": {"x": 0.95, "y": 0.8, "z": 0.55}},
+        },
+        legend={"x": 0.01, "y": 0.95},
+        margin={"l": 0, "r": 0, "t": 60, "b": 0},
+    )
     with written_atomically(path) as temporary:
         figure.write_html(str(temporary), include_plotlyjs=True, full_html=True, default_height="96vh")
 
 
 def _line(go: Any, points: np.ndarray, color: str, width: float, name: str, dash: str = "solid") -> Any:
     """A line on the sphere; it has a legend entry if it has a name."""
-    return go.Scatter3d(x=points[:, 0], y=points[:, 1], z=points[:, 2], mode="lines", name=name, showlegend=bool(name),
-                        line={"color": color, "width": width, "dash": dash}, hoverinfo="name" if name else "skip")
+    return go.Scatter3d(
+        x=points[:, 0],
+        y=points[:, 1],
+        z=points[:, 2],
+        mode="lines",
+        name=name,
+        showlegend=bool(name),
+        line={"color": color, "width": width, "dash": dash},
+        hoverinfo="name" if name else "skip",
+    )
 
 
 def _canvas(width: float, height: float) -> tuple[Any, Any]:
@@ -136,7 +236,9 @@ def _save(figure: Any, path: str | os.PathLike[str]) -> None:
         figure.savefig(temporary, dpi=130)
 
 
-def _draw_hemispheres(figure: Any, directions: np.ndarray, fixed: np.ndarray, cones: Sequence[KeepOut], axis: np.ndarray) -> None:
+def _draw_hemispheres(
+    figure: Any, directions: np.ndarray, fixed: np.ndarray, cones: Sequence[KeepOut], axis: np.ndarray
+) -> None:
     """Two equal-area discs, the half of the sphere with z > 0 and the half with z < 0."""
     grid = figure.add_gridspec(1, 2)
     entries: dict[str, Any] = {}
@@ -162,8 +264,11 @@ def _draw_hemispheres(figure: Any, directions: np.ndarray, fixed: np.ndarray, co
             here = sign * ring[:, 2] >= 0
             lines = np.where(here[:, None], ring[:, :2] / np.sqrt(1 + np.abs(ring[:, 2:])), np.nan)
             ax.plot(lines[:, 0], lines[:, 1], color=_CONE, lw=1.4, label=f"keep out: {cone.name}")
-        for rows, color, label, marker in ((directions, _STAR, "best directions", "o"), (fixed, _FIXED, "on board", "s"),
-                                           (np.array([axis, -axis]), _AXIS, "axis of K1", "x")):
+        for rows, color, label, marker in (
+            (directions, _STAR, "best directions", "o"),
+            (fixed, _FIXED, "on board", "s"),
+            (np.array([axis, -axis]), _AXIS, "axis of K1", "x"),
+        ):
             points = flat(rows)
             if len(rows):
                 ax.scatter(points[:, 0], points[:, 1], color=color, marker=marker, s=36, label=label, zorder=3)
@@ -176,16 +281,23 @@ def sphere_picture(configuration: Configuration, path: str | os.PathLike[str]) -
     """Write a picture (PNG) of a configuration: both halves of the sphere in an equal-area projection."""
     figure, _ = _canvas(8.4, 4.9)
     request = configuration.request
-    figure.suptitle(f"{request.count} directions, best for {request.criterion}: K0 = {configuration.K0:.5g}, "
-                    f"K1 = {configuration.K1:.5g} (sigma = 1)", fontsize=11)
-    _draw_hemispheres(figure, configuration.directions, np.array(request.fixed).reshape(-1, 3), request.keep_outs, configuration.axis)
+    figure.suptitle(
+        f"{request.count} directions, best for {request.criterion}: K0 = {configuration.K0:.5g}, "
+        f"K1 = {configuration.K1:.5g} (sigma = 1)",
+        fontsize=11,
+    )
+    _draw_hemispheres(
+        figure, configuration.directions, np.array(request.fixed).reshape(-1, 3), request.keep_outs, configuration.axis
+    )
     _save(figure, path)
 
 
 def sky_picture(selection: Selection, catalogue: Any, cameras: Sequence[Camera], path: str | os.PathLike[str]) -> None:
     """Write a picture (PNG) of each camera's field: visible stars by brightness, the chosen ones marked and named."""
     figure, _ = _canvas(5.2 * len(cameras), 5.6)
-    figure.suptitle(f"K0 = {selection.criteria.K0:.5g}, K1 = {selection.criteria.K1:.5g} (sigma = 1); {selection.why}", fontsize=10)
+    figure.suptitle(
+        f"K0 = {selection.criteria.K0:.5g}, K1 = {selection.criteria.K1:.5g} (sigma = 1); {selection.why}", fontsize=10
+    )
     candidates = selection.candidates
     inside = np.zeros(len(candidates), dtype=bool)
     inside[selection.chosen] = True
@@ -211,8 +323,14 @@ def sky_picture(selection: Selection, catalogue: Any, cameras: Sequence[Camera],
             ax.scatter(points[:, 0], points[:, 1], s=size, color=color, label=f"{label} ({int(mask.sum())})", zorder=3)
             if label == "chosen":
                 for (x, y), star in zip(points, candidates.star[mask], strict=True):
-                    ax.annotate(str(catalogue.name[star] or catalogue.identifier[star]), (x, y), xytext=(4, 4),
-                                textcoords="offset points", fontsize=7, color=_INK)
+                    ax.annotate(
+                        str(catalogue.name[star] or catalogue.identifier[star]),
+                        (x, y),
+                        xytext=(4, 4),
+                        textcoords="offset points",
+                        fontsize=7,
+                        color=_INK,
+                    )
         ax.set_aspect("equal")
         ax.set_xlabel("across the boresight [deg]")
         ax.set_ylabel("across the boresight [deg]")
@@ -236,8 +354,13 @@ def plan_picture(plan: SightingPlan, path: str | os.PathLike[str]) -> None:
     top.legend(fontsize=8, loc="upper left")
     top.set_title(f"{len(arcs)} sightings; {plan.acquisitions} acquisitions", fontsize=10)
     for column, color in enumerate((_STAR, _FIXED, _AXIS)):
-        bottom.plot(plan.times / 60, np.where(np.isfinite(plan.axis_sigma[:, column]), plan.axis_sigma[:, column], np.nan), color=color,
-                    lw=1.2, label=f"about {'xyz'[column]}")
+        bottom.plot(
+            plan.times / 60,
+            np.where(np.isfinite(plan.axis_sigma[:, column]), plan.axis_sigma[:, column], np.nan),
+            color=color,
+            lw=1.2,
+            label=f"about {'xyz'[column]}",
+        )
     bottom.set_xlabel("time [min]")
     bottom.set_ylabel("error [sigma]")
     bottom.set_ylim(bottom=0)

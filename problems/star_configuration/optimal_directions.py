@@ -7,15 +7,15 @@ The problem is written with one small block per direction, so that its cost grow
     subject to  L L^T = (1/N) sum_i M_i(b_i) + fixed,   |b_i| = 1
                 cos(maximum angle) <= b_i . b_j <= cos(minimum angle)   between sensors, fixed ones included
                 |b_i . b_j| <= cos(angle limit)                         the paper's bound, on the angle of the lines
-                b_i . k <= cos(half angle)                              keep-out cones (Sun, Earth limb, Moon, structure)
-                |b_i . V| <= cos(axis clearance)                        distance from the axis of K1, on both sides
+                b_i . k <= cos(half angle)                              keep-out cones (Sun, Earth, Moon, structure)
+                |b_i . V| <= cos(axis clearance)                        distance from the axis of K1, both sides
 
-Holding the information as ``L L^T`` keeps it positive definite along the whole iteration. Rotations that leave the problem as
-it is are fixed: for K0 without fixed sensors and cones the first direction is +z and the second lies in the x-z plane; for
-K1 without them the first direction lies in one half-plane through the axis.
+Holding the information as ``L L^T`` keeps it positive definite along the whole iteration. Rotations that leave the
+problem as it is are fixed: for K0 without fixed sensors and cones the first direction is +z and the second lies in the
+x-z plane; for K1 without them the first direction lies in one half-plane through the axis.
 
-K1 has no minimum where directions may come as close to the axis as they like: it falls to 1/N while the turn about the axis
-is lost. Without any limit that keeps them apart the axis clearance is ``DEFAULT_AXIS_CLEARANCE``.
+K1 has no minimum where directions may come as close to the axis as they like: it falls to 1/N while the turn about the
+axis is lost. Without any limit that keeps them apart the axis clearance is ``DEFAULT_AXIS_CLEARANCE``.
 """
 
 from __future__ import annotations
@@ -39,11 +39,19 @@ DEFAULT_AXIS_CLEARANCE = 0.01  # rad
 LARGEST_COUNT = 2000
 """Directions in one problem; a larger number is a slip of the keyboard."""
 
-_OPTIONS = {
+_OPTIONS: dict[str, Any] = {
     "print_time": False,
     "error_on_fail": False,
-    "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-11, "constr_viol_tol": 1e-12, "acceptable_tol": 1e-9,
-              "max_iter": 600, "mu_strategy": "adaptive", "bound_relax_factor": 0.0},
+    "ipopt": {
+        "print_level": 0,
+        "sb": "yes",
+        "tol": 1e-11,
+        "constr_viol_tol": 1e-12,
+        "acceptable_tol": 1e-9,
+        "max_iter": 600,
+        "mu_strategy": "adaptive",
+        "bound_relax_factor": 0.0,
+    },
 }
 
 
@@ -66,8 +74,13 @@ class KeepOut:
         unit = criteria.unit_vectors(self.direction, f"keep-out {self.name}")[0]
         object.__setattr__(self, "direction", tuple(float(x) for x in unit))
         if not 0 <= self.half_angle < np.pi:
-            raise RequestError("the half-angle of a keep-out cone is out of range", where=f"keep-out {self.name}",
-                               value=f"{self.half_angle} rad", limit="0 to pi", remedy="give it in radians")
+            raise RequestError(
+                "the half-angle of a keep-out cone is out of range",
+                where=f"keep-out {self.name}",
+                value=f"{self.half_angle} rad",
+                limit="0 to pi",
+                remedy="give it in radians",
+            )
 
 
 def _tuples(value: Any) -> Any:
@@ -85,9 +98,10 @@ class Request:
         count: number of directions to find.
         criterion: "K0" or "K1".
         axis: body axis of K1 (3).
-        sigma: total accuracy of a direction, one number or one per direction (any unit: the criteria are in its square).
-        two_axis_sigma: instead of ``sigma``, standard deviations (count x 2) along the two axes of each sensor; the turn of
-            the sensor about its line of sight is then optimised too.
+        sigma: total accuracy of a direction, one number or one per direction (any unit: the criteria are in its
+            square).
+        two_axis_sigma: instead of ``sigma``, standard deviations (count x 2) along the two axes of each sensor; the
+            turn of the sensor about its line of sight is then optimised too.
         minimum_angle, maximum_angle: limits (rad) on the angle between any two sensors.
         angle_limit: least angle (rad) between any two LINES of sight: ``|c_ij| <= cos(angle_limit)``.
         keep_outs: cones in body axes.
@@ -112,8 +126,9 @@ class Request:
         for name in ("sigma", "fixed_sigma", "two_axis_sigma", "keep_outs", "fixed"):
             object.__setattr__(self, name, _tuples(getattr(self, name)))
         if not 1 <= self.count <= LARGEST_COUNT:
-            raise RequestError("the number of directions is out of range", where="N", value=self.count,
-                               limit=f"1 to {LARGEST_COUNT}")
+            raise RequestError(
+                "the number of directions is out of range", where="N", value=self.count, limit=f"1 to {LARGEST_COUNT}"
+            )
         if self.criterion not in ("K0", "K1"):
             raise RequestError("unknown criterion", where="criterion", value=self.criterion, limit="K0 or K1")
         axis = criteria.unit_vectors(self.axis, "axis")
@@ -127,18 +142,31 @@ class Request:
             value = getattr(self, name)
             top = np.pi if name.startswith("m") else np.pi / 2
             if value is not None and not 0 <= value <= top:
-                raise RequestError("an angle is out of range", where=name, value=f"{value} rad",
-                                   limit=f"0 to {top:.4f} rad", remedy="angles are in radians here")
+                raise RequestError(
+                    "an angle is out of range",
+                    where=name,
+                    value=f"{value} rad",
+                    limit=f"0 to {top:.4f} rad",
+                    remedy="angles are in radians here",
+                )
         for name, number in (("sigma", self.count), ("fixed_sigma", len(self.fixed))):
             values = np.atleast_1d(np.asarray(getattr(self, name), dtype=float))
             if values.size not in (1, number) or not np.all(np.isfinite(values)) or np.any(values <= 0):
-                raise RequestError("accuracies are positive numbers, one for all or one for each", where=name,
-                                   value=getattr(self, name), limit=f"1 or {number} values above 0")
+                raise RequestError(
+                    "accuracies are positive numbers, one for all or one for each",
+                    where=name,
+                    value=getattr(self, name),
+                    limit=f"1 or {number} values above 0",
+                )
         if self.two_axis_sigma is not None:
             pairs = np.asarray(self.two_axis_sigma, dtype=float)
             if pairs.shape != (self.count, 2) or not np.all(np.isfinite(pairs)) or np.any(pairs <= 0):
-                raise RequestError("two positive accuracies are needed for each direction", where="two_axis_sigma",
-                                   value=f"shape {pairs.shape}", limit=f"({self.count}, 2)")
+                raise RequestError(
+                    "two positive accuracies are needed for each direction",
+                    where="two_axis_sigma",
+                    value=f"shape {pairs.shape}",
+                    limit=f"({self.count}, 2)",
+                )
 
     @property
     def clearance(self) -> float:
@@ -189,7 +217,8 @@ class Configuration:
     request: Request = field(repr=False)
 
     def __str__(self) -> str:
-        head = f"{self.request.criterion}: {self.status}. {self.why}\nK0 = {self.K0:.12g}  K1 = {self.K1:.12g}  (sigma = 1)"
+        head = f"{self.request.criterion}: {self.status}. {self.why}\n"
+        head += f"K0 = {self.K0:.12g}  K1 = {self.K1:.12g}  (sigma = 1)"
         rows = [f"{i + 1:4d}  {x:+.12f}  {y:+.12f}  {z:+.12f}" for i, (x, y, z) in enumerate(self.directions)]
         return "\n".join([head, "   #        x                y                z", *rows])
 
@@ -424,8 +453,9 @@ def solve_from(request: Request, directions: np.ndarray, generator: np.random.Ge
     program = _program(request)
     generator = generator or np.random.default_rng(0)
     start = _start(request, program, directions, generator)
-    answer = program.solver(x0=start, lbx=program.lower, ubx=program.upper, lbg=program.constraint_lower,
-                            ubg=program.constraint_upper)
+    answer = program.solver(
+        x0=start, lbx=program.lower, ubx=program.upper, lbg=program.constraint_lower, ubg=program.constraint_upper
+    )
     statistics = program.solver.stats()
     x = np.array(answer["x"]).reshape(-1)
     rows = x[: 3 * request.count].reshape(-1, 3)
@@ -444,13 +474,24 @@ def solve_from(request: Request, directions: np.ndarray, generator: np.random.Ge
         value = np.inf
     # IPOPT may stop where rounding hides further progress; that point counts if every limit holds there.
     residual = np.array(answer["g"]).reshape(-1)
-    violation = max(float(np.max(program.constraint_lower - residual, initial=0)),
-                    float(np.max(residual - program.constraint_upper, initial=0)))
+    violation = max(
+        float(np.max(program.constraint_lower - residual, initial=0)),
+        float(np.max(residual - program.constraint_upper, initial=0)),
+    )
     word = str(statistics["return_status"])
     good = word in ("Solve_Succeeded", "Solved_To_Acceptable_Level") or (
-        word == "Search_Direction_Becomes_Too_Small" and violation < 1e-9)
-    return LocalOptimum(rows, first_axes, value, bool(good and usable and violation < 1e-8), word,
-                        x, np.array(answer["lam_g"]).reshape(-1), residual)
+        word == "Search_Direction_Becomes_Too_Small" and violation < 1e-9
+    )
+    return LocalOptimum(
+        rows,
+        first_axes,
+        value,
+        bool(good and usable and violation < 1e-8),
+        word,
+        x,
+        np.array(answer["lam_g"]).reshape(-1),
+        residual,
+    )
 
 
 def _infeasibility(request: Request, generator: np.random.Generator, starts: int = 6) -> float:
@@ -463,8 +504,13 @@ def _infeasibility(request: Request, generator: np.random.Generator, starts: int
         if _two_axis(request) is not None:
             axes = np.cross(turned, random_directions(request.count, generator))
             pieces.append((axes / np.linalg.norm(axes, axis=1)[:, None]).reshape(-1))
-        answer = program.solver(x0=np.concatenate([*pieces, [1.0]]), lbx=program.lower, ubx=program.upper,
-                                lbg=program.constraint_lower, ubg=program.constraint_upper)
+        answer = program.solver(
+            x0=np.concatenate([*pieces, [1.0]]),
+            lbx=program.lower,
+            ubx=program.upper,
+            lbg=program.constraint_lower,
+            ubg=program.constraint_upper,
+        )
         if program.solver.stats()["success"]:
             least = min(least, float(answer["f"]))
         if least <= 0:
@@ -489,8 +535,10 @@ def _starts(request: Request, number: int, generator: np.random.Generator) -> li
 
 
 def _default_starts(request: Request) -> int:
-    if request.criterion == "K0" and request.isotropic and request.angle_limit is None \
-            and request.minimum_angle is None and request.maximum_angle is None:
+    """Three where no worse local optimum is known to exist (K0 of plain sensors without limits), more elsewhere."""
+    limits = (request.angle_limit, request.minimum_angle, request.maximum_angle)
+    plain = request.isotropic and all(limit is None for limit in limits) and _two_axis(request) is None
+    if request.criterion == "K0" and plain:
         return 3
     return 12 if request.count <= 30 else 6
 
@@ -518,10 +566,27 @@ def optimal_directions(request: Request, *, starts: int | None = None, seed: int
         if request.keep_outs:
             b = _free_direction(request)[None, :]
         found = criteria.criteria_of_information(total_information(request, b), axis)
-        why = ("one direction does not determine the attitude: the rotation about the line of sight "
-               f"({', '.join(f'{x:.6g}' for x in b[0])}) is not seen; sight two stars or more")
-        return Configuration("unobservable", why, b, None, found.K0, found.K1, axis, None, found.unobservable, np.inf,
-                             0, 0, 0, time.perf_counter() - began, request)
+        why = (
+            "one direction does not determine the attitude: the rotation about the line of sight "
+            f"({', '.join(f'{x:.6g}' for x in b[0])}) is not seen; sight two stars or more"
+        )
+        return Configuration(
+            "unobservable",
+            why,
+            b,
+            None,
+            found.K0,
+            found.K1,
+            axis,
+            None,
+            found.unobservable,
+            np.inf,
+            0,
+            0,
+            0,
+            time.perf_counter() - began,
+            request,
+        )
     number = starts if starts is not None else _default_starts(request)
     generator = np.random.default_rng(seed)
     results = [solve_from(request, start, generator) for start in _starts(request, number, generator)]
@@ -530,9 +595,11 @@ def optimal_directions(request: Request, *, starts: int | None = None, seed: int
         excess = _infeasibility(request, generator)
         if excess > 1e-7:
             raise InfeasibleError(
-                f"no {request.count} directions meet the limits: the closest try breaks one by {excess:.3g} in the cosine "
-                "of an angle; relax the angle limits or the keep-out cones, or ask for fewer directions",
-                limit="angles", excess=excess)
+                f"no {request.count} directions meet the limits: the closest try breaks one by {excess:.3g} in the "
+                "cosine of an angle; relax the angle limits or the keep-out cones, or ask for fewer directions",
+                limit="angles",
+                excess=excess,
+            )
         best = min(results, key=lambda r: r.value)
     else:
         best = min(good, key=lambda r: r.value)
@@ -541,30 +608,62 @@ def optimal_directions(request: Request, *, starts: int | None = None, seed: int
     status = "ok" if best.converged else "not_converged"
     if found.covariance is None:
         status = "unobservable"
-    return Configuration(status, _sentence(request, status, best, len(good), number, agreeing, found), best.directions,
-                         best.first_axes, found.K0, found.K1, axis, found.covariance, found.unobservable, best.value,
-                         number, len(good), agreeing, time.perf_counter() - began, request)
+    return Configuration(
+        status,
+        _sentence(request, status, best, len(good), number, agreeing, found),
+        best.directions,
+        best.first_axes,
+        found.K0,
+        found.K1,
+        axis,
+        found.covariance,
+        found.unobservable,
+        best.value,
+        number,
+        len(good),
+        agreeing,
+        time.perf_counter() - began,
+        request,
+    )
 
 
-def _sentence(request: Request, status: str, best: LocalOptimum, converged: int, starts: int, agreeing: int,
-              found: criteria.Criteria) -> str:
+def _sentence(
+    request: Request,
+    status: str,
+    best: LocalOptimum,
+    converged: int,
+    starts: int,
+    agreeing: int,
+    found: criteria.Criteria,
+) -> str:
     """What happened, for the user."""
     if status == "not_converged":
-        return (f"none of {starts} starts converged (the last word of the solver on the best: {best.word}); "
-                "the directions are the best point that was reached")
+        return (
+            f"none of {starts} starts converged (the last word of the solver on the best: {best.word}); "
+            "the directions are the best point that was reached"
+        )
     if status == "unobservable":
         return "the directions allowed by the limits do not determine the attitude: a rotation about them is not seen"
     text = f"{agreeing} of {starts} starts reached this value"
     if converged < starts:
         text += f" ({starts - converged} did not converge)"
-    if request.criterion == "K1" and not request.fixed and len(set(np.atleast_1d(request.sigma))) == 1 \
-            and request.two_axis_sigma is None:
+    if (
+        request.criterion == "K1"
+        and not request.fixed
+        and len(set(np.atleast_1d(request.sigma))) == 1
+        and request.two_axis_sigma is None
+    ):
         sigma = float(np.atleast_1d(request.sigma)[0])
         limit = limit_K1(request.count) * sigma**2
-        about = float(np.array(request.axis) @ found.covariance @ np.array(request.axis)) \
-            if found.covariance is not None else np.inf
-        text += (f"; K1 is {found.K1 / limit - 1:.3g} above its limit sigma^2/N = {limit:.6g}, which directions along the axis "
-                 f"approach and never attain; its price is a variance of {about:.6g} about the axis")
+        about = (
+            float(np.array(request.axis) @ found.covariance @ np.array(request.axis))
+            if found.covariance is not None
+            else np.inf
+        )
+        text += (
+            f"; K1 is {found.K1 / limit - 1:.3g} above its limit sigma^2/N = {limit:.6g}, which directions along the "
+            f"axis approach and never attain; its price is a variance of {about:.6g} about the axis"
+        )
         if request.clearance > 0:
             text += f" (directions kept {np.degrees(request.clearance):.4g} deg away from the axis)"
     return text
@@ -580,6 +679,7 @@ def _free_direction(request: Request) -> np.ndarray:
     rows = np.vstack((np.array(request.axis), random_directions(2000, generator)))
     margin = np.min([np.cos(c.half_angle) - rows @ np.array(c.direction) for c in request.keep_outs], axis=0)
     if margin.max() < 0:
-        raise InfeasibleError("the keep-out cones leave no direction free", limit="keep-out cones",
-                              excess=float(-margin.max()))
+        raise InfeasibleError(
+            "the keep-out cones leave no direction free", limit="keep-out cones", excess=float(-margin.max())
+        )
     return rows[0] if margin[0] >= 0 else rows[int(np.argmax(margin))]

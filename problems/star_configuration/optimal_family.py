@@ -1,10 +1,11 @@
 """All optima of a request, not one: how many dimensions the family has, its members, and the senses they allow.
 
-Neither criterion sees the sense of a direction (``b`` and ``-b`` are one), and none sees the order of equal sensors. Beyond
-that, optima of K0 without limits are exactly the tight frames ``B B^T = (N/3) I``: for N >= 5 they form a family
-of dimension ``2 N - 8`` after rotations are removed (2 N angles, 5 conditions, 3 rotations), for N = 3 and 4 they stand alone
-(three perpendicular lines; the four diagonals of a cube). Limits cut the family down or make it a set of separate points,
-as with K1 for two stars, where the axis is the sum bisector or, with one star reversed, the difference bisector.
+Neither criterion sees the sense of a direction (``b`` and ``-b`` are one), and none sees the order of equal sensors.
+Beyond that, optima of K0 without limits are exactly the tight frames ``B B^T = (N/3) I``: for N >= 5 they form a family
+of dimension ``2 N - 8`` after rotations are removed (2 N angles, 5 conditions, 3 rotations), for N = 3 and 4 they
+stand alone (three perpendicular lines; the four diagonals of a cube). Limits cut the family down or make it a set of
+separate points, as with K1 for two stars, where the axis is the sum bisector or, with one star reversed, the
+difference bisector.
 
 The dimension is measured, not assumed: it is the number of directions, inside the active limits, in which the
 Hessian of the Lagrangian is flat. Members come from many starts and are grouped by a signature that no rotation,
@@ -73,7 +74,7 @@ def signature(request: Request, directions: np.ndarray) -> np.ndarray:
 
 
 def family_dimension(request: Request, optimum: LocalOptimum) -> int:
-    """Number of independent moves from ``optimum`` that keep the limits and leave the criterion flat to second order."""
+    """Number of independent moves from ``optimum`` that keep the limits and the criterion, to second order."""
     program = _program(request)
     x, multipliers = optimum.variables, optimum.multipliers
     jacobian = np.array(program.solver.get_function("nlp_jac_g")(x, [])[1].full())
@@ -145,11 +146,15 @@ def optimal_family(request: Request, *, starts: int = 40, seed: int = 0) -> Opti
     lowest = min((o for o in optima if o.value <= value + tolerance), key=lambda o: o.value, default=None)
     dimension = family_dimension(request, lowest) if lowest is not None else 0
     if dimension:
-        why = (f"the optima form a family of {dimension} dimensions; {len(members)} different members of it were found "
-               f"from {starts} starts, and every direction may be reversed where the limits allow it")
+        why = (
+            f"the optima form a family of {dimension} dimensions; {len(members)} different members of it were found "
+            f"from {starts} starts, and every direction may be reversed where the limits allow it"
+        )
     else:
-        why = (f"{len(members)} separate optimum{'' if len(members) == 1 else 's'} up to rotation, order and sense; "
-               "every direction may be reversed where the limits allow it")
+        why = (
+            f"{len(members)} separate optimum{'' if len(members) == 1 else 's'} up to rotation, order and sense; "
+            "every direction may be reversed where the limits allow it"
+        )
     return OptimalFamily(value, dimension, tuple(members), tuple(worse), starts, reached, why)
 
 
@@ -180,6 +185,10 @@ def meets_limits(request: Request, directions: np.ndarray, tolerance: float = 1e
         return False
     if request.angle_limit is not None and np.any(np.abs(pairs) > np.cos(request.angle_limit) + tolerance):
         return False
-    if request.clearance > 0 and np.any(np.abs(directions @ np.array(request.axis)) > np.cos(request.clearance) + tolerance):
+    if request.clearance > 0 and np.any(
+        np.abs(directions @ np.array(request.axis)) > np.cos(request.clearance) + tolerance
+    ):
         return False
-    return all(np.all(directions @ np.array(c.direction) <= np.cos(c.half_angle) + tolerance) for c in request.keep_outs)
+    return all(
+        np.all(directions @ np.array(c.direction) <= np.cos(c.half_angle) + tolerance) for c in request.keep_outs
+    )
