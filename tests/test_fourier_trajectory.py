@@ -1,4 +1,4 @@
-"""The Fourier frame: derivatives, the frame property that the paper misses, its singular directions, fast evaluation."""
+"""The Fourier frame: derivatives, the frame property that the paper misses, singular directions, fast evaluation."""
 
 from __future__ import annotations
 
