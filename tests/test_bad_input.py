@@ -1,4 +1,4 @@
-"""Bad input: each defect gets its own typed error that says what, where, value and limit; harmless oddities are accepted.
+"""Bad input: each defect gets its own typed error (what, where, value, limit); harmless oddities are accepted.
 
 Defects are put into a generated campaign, written to a file and read back, as a user would meet them.
 """

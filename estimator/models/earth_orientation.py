@@ -12,7 +12,9 @@ bias of 0.02 arc seconds (0.1 microradian).
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+import warnings
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 
 import numpy as np
@@ -60,7 +62,8 @@ def tai_from_utc(texts: Iterable[str]) -> np.ndarray:
             raise FileFormatError("this is no UTC date and time", value=repr(text)) from error
         key = (year, month, day)
         if key not in known:
-            known[key] = float(erfa.dat(year, month, day, 0.0))
+            with _future_allowed():
+                known[key] = float(erfa.dat(year, month, day, 0.0))
         whole.append(date)
         seconds.append(float(found[6]))
         offsets.append(known[key])
@@ -73,7 +76,8 @@ def utc_text(tai: np.datetime64) -> str:
     import erfa
 
     days, fraction = _julian_date(np.array([tai]))
-    year, month, day, clock = erfa.d2dtf("UTC", 6, *erfa.taiutc(days, fraction))
+    with _future_allowed():
+        year, month, day, clock = erfa.d2dtf("UTC", 6, *erfa.taiutc(days, fraction))
     h, m, s, f = (int(clock[name][0]) for name in ("h", "m", "s", "f"))
     text = f"{int(year[0]):04d}-{int(month[0]):02d}-{int(day[0]):02d}T{h:02d}:{m:02d}:{s:02d}"
     return f"{text}.{f:06d}Z" if f else f"{text}Z"
@@ -83,6 +87,16 @@ def _julian_date(tai: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Two-part TAI Julian date."""
     days = (tai.astype("datetime64[us]") - _J2000) / np.timedelta64(1, "us") / 1e6 / _DAY
     return np.full(days.shape, _J2000_JULIAN_DATE), days
+
+
+@contextmanager
+def _future_allowed() -> Iterator[None]:
+    """Without the warning that leap seconds of years to come are not known."""
+    import erfa
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", erfa.ErfaWarning)
+        yield
 
 
 @lru_cache(maxsize=1)
@@ -96,7 +110,8 @@ def _bulletin() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     known = np.isfinite(np.asarray(table["UT1_UTC"].value, dtype=float))
     date = date[known]
     year, month, day, _ = erfa.jd2cal(2400000.5, date)
-    offset = erfa.dat(year, month, day, 0.0)
+    with _future_allowed():
+        offset = erfa.dat(year, month, day, 0.0)
     arc_second = np.pi / 180 / 3600  # [rad]
     return (
         date,
@@ -111,7 +126,8 @@ def _orientation(tai: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     import erfa
 
     date, offset, x, y = _bulletin()
-    one, two = erfa.taiutc(*_julian_date(tai))
+    with _future_allowed():
+        one, two = erfa.taiutc(*_julian_date(tai))
     when = (one - 2400000.5) + two
     if when.size and (when.min() < date[0] or when.max() > date[-1] + _HELD):
         worst = when.min() if when.min() < date[0] else when.max()

@@ -10,11 +10,8 @@ import typer
 from estimator.models.errors import RequestError
 from problems import console
 
-import_app = typer.Typer(help="Measurements of other origin to a campaign file.", no_args_is_help=True)
 
-
-@import_app.command("sentinel1")
-def import_sentinel1_command(
+def import_sentinel1(
     files: Annotated[
         list[Path],
         typer.Argument(
@@ -31,7 +28,8 @@ def import_sentinel1_command(
 
 def _imported(files: list[Path]) -> tuple[dict[str, Any], Any]:
     """Import, write, and say what the campaign holds."""
-    from problems.alignment.sentinel1_import import import_sentinel1, is_orbit_file
+    from problems.alignment.sentinel1_import import import_sentinel1 as campaign_from
+    from problems.alignment.sentinel1_import import is_orbit_file
     from problems.readers.campaign_file import write_campaign
 
     *sources, target = files
@@ -45,7 +43,7 @@ def _imported(files: list[Path]) -> tuple[dict[str, Any], Any]:
     annotations = [f for f in sources if not is_orbit_file(f)]
     with console.progress() as bar:
         bar.add_task(f"reading {len(sources)} files", total=None)
-        campaign = import_sentinel1(annotations, [f for f in sources if is_orbit_file(f)])
+        campaign = campaign_from(annotations, [f for f in sources if is_orbit_file(f)])
         write_campaign(campaign, target)
     doppler = campaign.doppler
     assert doppler is not None  # an import without Doppler estimates raises

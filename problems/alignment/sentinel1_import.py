@@ -127,7 +127,7 @@ def beam_directions(
         height: (n,) m, of the scene above the WGS84 ellipsoid.
 
     Returns:
-        (n, k, 3) unit vectors in body axes, on the side of nadir where the antenna looks (towards -x).
+        (n, k, 3) unit vectors in body axes, on the side of nadir where the antenna (body -z) looks.
 
     Raises:
         GeometryError: a slant range at which the x-z plane does not meet the Earth.
@@ -141,7 +141,7 @@ def beam_directions(
     ground = 1 / np.sqrt(np.sum((position / radius[:, None] / axes) ** 2, axis=1))
     cosine = (radius[:, None] ** 2 + distance**2 - ground[:, None] ** 2) / (2 * radius[:, None] * distance)
     with np.errstate(invalid="ignore"):
-        angle = nadir[:, None] - np.arccos(cosine)
+        angle = nadir[:, None] - np.sign(nadir)[:, None] * np.arccos(cosine)
 
     def miss(angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """How far the point at that angle lies off the ellipsoid (relative), and the derivative by the angle."""
