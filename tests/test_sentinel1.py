@@ -1,7 +1,8 @@
 """Sentinel-1 annotations: the geometry Doppler is reproduced, and the campaign made of them carries it without loss.
 
 A generated annotation stands in where the measured ones are absent. Its numbers come by another way than the
-importer's: a ray is cut with the ellipsoid by the quadratic formula for chosen elevations, and the celestial frame is astropy's.
+importer's: a ray is cut with the ellipsoid by the quadratic formula for chosen elevations, and the celestial frame is
+astropy's.
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ from estimator.models.errors import (
     RequestError,
     TooFewDataError,
 )
-from problems.alignment.campaign import Campaign
 from problems.alignment import commands_import
+from problems.alignment.campaign import Campaign
 from problems.alignment.sentinel1_import import (
     beam_directions,
     campaign_of,
@@ -493,6 +494,17 @@ def test_geometry_doppler_of_every_measured_annotation(annotations: list[Annotat
     assert np.sqrt(np.mean(everything**2)) < 1.0  # Hz over all files
     for name, d in difference.items():
         assert np.abs(d).max() < 2.5, name  # Hz in the worst
+
+
+@needs_data
+def test_the_processor_leaves_out_polar_motion_and_ut1(annotations: list[Annotation]) -> None:
+    """With the simplifications of the processor nothing constant is left in any file."""
+    compared = [compare_geometry(a) for a in annotations]
+    processed = [c.as_processed - c.annotated for c in compared]
+    full = [c.ours - c.annotated for c in compared]
+    assert np.sqrt(np.mean(np.concatenate([d.ravel() for d in processed]) ** 2)) < 0.4
+    assert max(abs(np.mean(d)) for d in processed) < 0.2
+    assert max(abs(np.mean(d)) for d in full) > 1.5
 
 
 @needs_data

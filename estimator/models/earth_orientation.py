@@ -140,11 +140,13 @@ def _orientation(tai: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.interp(when, date, offset), np.interp(when, date, x), np.interp(when, date, y)
 
 
-def earth_fixed_from_celestial(tai: np.ndarray) -> np.ndarray:
+def earth_fixed_from_celestial(tai: np.ndarray, *, polar_motion: bool = True, ut1: bool = True) -> np.ndarray:
     """Rotation matrices from GCRS to the terrestrial frame (ITRS).
 
     Args:
         tai: (n,) datetime64[us], TAI.
+        polar_motion: False leaves it out (up to 2 microradians), as simpler processors do.
+        ut1: False takes UTC in its place (up to 0.9 s or 66 microradians), as simpler processors do.
 
     Returns:
         (n, 3, 3), with ``v_earth_fixed = matrix @ v_celestial`` (directions; the Earth's rotation is not in it).
@@ -156,6 +158,12 @@ def earth_fixed_from_celestial(tai: np.ndarray) -> np.ndarray:
 
     ut1_minus_tai, x, y = _orientation(tai)
     days, fraction = _julian_date(tai)
+    if not ut1:  # UTC lies a whole number of seconds behind TAI
+        with _future_allowed():
+            one, two = erfa.taiutc(days, fraction)
+        ut1_minus_tai = np.round(((one - days) + (two - fraction)) * _DAY)
+    if not polar_motion:
+        x, y = np.zeros_like(x), np.zeros_like(y)
     return erfa.c2t06a(days, fraction + _TT_MINUS_TAI / _DAY, days, fraction + ut1_minus_tai / _DAY, x, y)
 
 

@@ -185,6 +185,7 @@ def geometry_doppler(
     *,
     attitude: AttitudeVectors | None = None,
     orbit: StateVectors | None = None,
+    as_processed: bool = False,
 ) -> np.ndarray:
     """Doppler centroid that orbit, attitude and the Earth's orientation predict for the annotated mounting.
 
@@ -196,13 +197,19 @@ def geometry_doppler(
         times: (n,) datetime64[us], TAI.
         slant_time: (n, k) s, two-way.
         attitude, orbit: in place of those of the annotation.
+        as_processed: with the Earth's orientation as simple as the product's processor takes it: no polar motion, and
+            UTC in the place of UT1 where the orbit came from the downlink. (Found from the annotated polynomials; what
+            it leaves out is worth up to 1.8 Hz.)
 
     Returns:
         (n, k) Hz.
     """
     position, velocity = orbit_at(annotation.orbit if orbit is None else orbit, times)
     celestial_from_body = attitude_at(annotation.attitude if attitude is None else attitude, times)
-    earth_fixed_from_body = Rotation.from_matrix(earth_fixed_from_celestial(times)) * celestial_from_body
+    earth = earth_fixed_from_celestial(
+        times, polar_motion=not as_processed, ut1=annotation.orbit_from_file or not as_processed
+    )
+    earth_fixed_from_body = Rotation.from_matrix(earth) * celestial_from_body
     beams = beam_directions(slant_time, position, earth_fixed_from_body, scene_height(annotation, times))
     body_velocity = earth_fixed_from_body.inv().apply(velocity)
     return 2 * annotation.radar_frequency / SPEED_OF_LIGHT * np.einsum("nkj,nj->nk", beams, body_velocity)
@@ -238,11 +245,14 @@ class GeometryComparison:
     """Our geometry Doppler beside the annotated one, at evenly spaced slant ranges of each estimate.
 
     Attributes:
-        ours, annotated: (n, k) Hz.
+        ours: (n, k) Hz, with the full orientation of the Earth.
+        as_processed: (n, k) Hz, with that of the processor; see :func:`geometry_doppler`.
+        annotated: (n, k) Hz.
         measured: (n, k) Hz, of the radar data; NaN where the product has none.
     """
 
     ours: np.ndarray
+    as_processed: np.ndarray
     annotated: np.ndarray
     measured: np.ndarray
 
@@ -269,7 +279,9 @@ def compare_geometry(annotation: Annotation, *, points: int = 5) -> GeometryComp
             for e, s in zip(estimates, slant, strict=True)
         ]
     )
-    return GeometryComparison(geometry_doppler(annotation, times, slant), annotated, measured)
+    ours = geometry_doppler(annotation, times, slant)
+    as_processed = geometry_doppler(annotation, times, slant, as_processed=True)
+    return GeometryComparison(ours, as_processed, annotated, measured)
 
 
 # ---------------------------------------------------------------------------------------------------------------- #

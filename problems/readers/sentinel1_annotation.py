@@ -79,6 +79,7 @@ class Annotation:
         range_sampling_rate: Hz.
         slant_range_time: s, two-way, of the first range sample.
         samples: number of range samples of an image line.
+        orbit_from_file: the processor used an orbit file and not the orbit of the downlink.
         orbit: Earth-fixed state vectors.
         attitude: attitude of the body axes.
         estimates: Doppler estimates in order of time.
@@ -99,6 +100,7 @@ class Annotation:
     range_sampling_rate: float
     slant_range_time: float
     samples: int
+    orbit_from_file: bool
     orbit: StateVectors
     attitude: AttitudeVectors
     estimates: tuple[DopplerEstimate, ...]
@@ -155,6 +157,7 @@ def read_annotation(path: str | os.PathLike[str]) -> Annotation:
         range_sampling_rate=value("rangeSamplingRate"),
         slant_range_time=value("imageInformation/slantRangeTime"),
         samples=int(samples) if samples else 0,
+        orbit_from_file=(root.findtext(".//orbitDataFileUsed") or "true").strip().lower() == "true",
         orbit=_orbit(root, name),
         attitude=_attitude(root, name),
         estimates=_estimates(root, name),
