@@ -6,9 +6,10 @@ information, once; whatever else depends on the trajectory (Doppler, effects in 
 The cost of everything after that does not depend on the number of positions.
 
 Way: samples are compressed to polynomials on short cells (:mod:`estimator.models._polynomial_cells`), the frame is
-taken in the orthonormal functions that it concentrates on the arc (``concentrated_directions``), and one QR
-factorisation of the small matrix left solves the problem, with a singular value decomposition in its place where gaps
-or few samples leave directions undetermined. No normal equations of the frame, whose condition
+taken in the orthonormal functions that it concentrates on the arc (``concentrated_directions``), and one factorisation
+of the small matrix left solves the problem: Cholesky's with a refinement where samples fill the arc and the matrix is
+nearly orthogonal, Householder's elsewhere, with a singular value decomposition where gaps or few samples leave
+directions undetermined. No normal equations of the frame, whose condition
 number grows by (1 + sqrt 2)^4 with every degree, are formed anywhere.
 
 This is equations (20) to (25) of Likhansky and Alekseev as a least-squares problem. They print a projection, (22) and
@@ -33,11 +34,14 @@ from estimator.models._polynomial_cells import (
     merge,
     merge_vectors,
     polynomial_size,
+    project_on,
+    safe_triangle,
 )
 from estimator.models.errors import NotFiniteError, RequestError, ShapeError, TooFewDataError
 from estimator.models.fourier_trajectory import Directions, FourierFrame, concentrated_directions
 
 _RELATIVE_TOLERANCE = 1e-12  # of the largest singular value
+_SMALL_DEGREE = 100  # below which merging cells costs what it saves
 _NEGLIGIBLE = 0.1  # standard deviations
 # Length of the frame over that of the data, and largest degree: for arcs of few oscillations.
 _STRETCHED = ((16.0, 6), (4.0, 12))
@@ -50,16 +54,18 @@ _SMALLEST_SCALE = 0.01  # of the declared standard deviation, so that data witho
 class _Solution:
     """The factorised least-squares problem of merged cells in the orthonormal functions of a frame.
 
-    ``householder`` and ``tau`` hold the orthogonal part Q of the QR factorisation of the design; ``right`` maps zeta to
-    amounts of the functions; where a decomposition in singular values was needed, ``left`` takes the first rows of
-    Q^T z to zeta.
+    ``right`` maps zeta to amounts of the functions. Where the samples fill the arc, their design in these functions is
+    nearly orthogonal and ``triangle`` is its Cholesky factor. Elsewhere ``design`` and ``tau`` hold Householder's
+    orthogonal part Q, and where a decomposition in singular values was needed too, ``left`` takes the first rows
+    of Q^T z to zeta.
     """
 
     directions: Directions
-    householder: np.ndarray
-    tau: np.ndarray
+    design: np.ndarray
     right: np.ndarray
-    left: np.ndarray | None
+    triangle: np.ndarray | None = None
+    tau: np.ndarray | None = None
+    left: np.ndarray | None = None
 
     @property
     def rank(self) -> int:
@@ -67,7 +73,11 @@ class _Solution:
 
     def coordinates(self, vectors: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """zeta (rank, q) of right-hand sides of the merged cells, and the sum of squares (q,) left over."""
-        turned = _apply(self.householder, self.tau, np.concatenate(vectors))
+        stacked = np.concatenate(vectors)
+        if self.triangle is not None:
+            return project_on(self.triangle, self.design.T, stacked)
+        assert self.tau is not None
+        turned = _apply(self.design, self.tau, stacked)
         columns = self.tau.size
         top, left_over = turned[:columns], (turned[columns:] ** 2).sum(axis=0)
         if self.left is None:
@@ -311,7 +321,7 @@ def _merged(frame: FourierFrame, fine: Cells) -> tuple[Cells, ...]:
     phase = frequency * float(fine.half[0])
     factor = int(MERGED_PHASE // phase) if phase > 0.0 else 1
     factor = min(factor, 1 + int(np.rint((fine.middle[-1] - fine.middle[0]) / (2.0 * fine.half[0]))))
-    if factor < 2:
+    if factor < 2 or frame.degree < _SMALL_DEGREE:
         return (fine,)
     return fine, merge(fine, factor, polynomial_size(factor * phase))
 
@@ -324,18 +334,23 @@ def _solve(frame: FourierFrame, cells: Cells, total_weight: float, amplitude: fl
     directions = directions.above(max(_RELATIVE_TOLERANCE,
                                       weakest / (np.sqrt(total_weight) * float(directions.singular.max()))))
     design = _design(frame, cells, directions)
-    householder, tau, _, _ = lapack.dgeqrf(design, lwork=64 * design.shape[1], overwrite_a=1)
-    rows, columns = householder.shape
+    rows, columns = design.shape
+    if rows >= columns:
+        # Orthonormal functions on well-spread samples: the normal matrix is nearly diagonal, which is checked.
+        easy = safe_triangle(design.T @ design)
+        if easy is not None and float(np.abs(np.diag(easy)).min()) > 1e4 * weakest:
+            return _Solution(directions, design, lapack.dtrtri(easy)[0], triangle=easy)
+    householder, tau, _, _ = lapack.dgeqrf(design, lwork=64 * columns, overwrite_a=1)
     triangle = np.triu(householder[: min(rows, columns)])
     if rows >= columns:
         reciprocal, _ = lapack.dtrcon(triangle)
         largest = float(np.abs(triangle).sum(axis=0).max())
         if reciprocal * largest > 10.0 * max(weakest, _RELATIVE_TOLERANCE * largest):
-            return _Solution(directions, householder, tau, lapack.dtrtri(triangle)[0], None)
+            return _Solution(directions, householder, lapack.dtrtri(triangle)[0], tau=tau)
     u, singular, vt = np.linalg.svd(triangle, full_matrices=False)
     keep = singular > max(weakest, _RELATIVE_TOLERANCE * float(singular.max(initial=0.0)))
-    householder = np.asfortranarray(householder[:, : tau.size])
-    return _Solution(directions, householder, tau, vt[keep].T / singular[keep], np.ascontiguousarray(u[:, keep].T))
+    return _Solution(directions, np.asfortranarray(householder[:, : tau.size]), vt[keep].T / singular[keep], tau=tau,
+                     left=np.ascontiguousarray(u[:, keep].T))
 
 
 def _design(frame: FourierFrame, cells: Cells, directions: Directions) -> np.ndarray:

@@ -184,10 +184,10 @@ def compress_samples(layout: Layout, weight: np.ndarray, values: np.ndarray, siz
         if full and level > 0.0 and (w == level).all():
             # All such cells of a grid have the same triangle but for the weight.
             if grid_triangle is None:
-                grid_triangle = _safe_triangle(table @ table.T)
+                grid_triangle = safe_triangle(table @ table.T)
             if grid_triangle is not None:
                 scale = np.sqrt(level)
-                vector, remainder = _project(grid_triangle, table, y)
+                vector, remainder = project_on(grid_triangle, table, y)
                 triangles.append(scale * grid_triangle)
                 vectors.append(scale * vector)
                 rest += level * remainder
@@ -195,9 +195,9 @@ def compress_samples(layout: Layout, weight: np.ndarray, values: np.ndarray, siz
         root = np.sqrt(w)
         table = table * root
         y = root[:, None] * y
-        triangle = _safe_triangle(table @ table.T)
+        triangle = safe_triangle(table @ table.T)
         if triangle is not None:
-            vector, remainder = _project(triangle, table, y)
+            vector, remainder = project_on(triangle, table, y)
         else:
             turn, triangle = np.linalg.qr(table.T)
             vector = turn.T @ y
@@ -210,7 +210,7 @@ def compress_samples(layout: Layout, weight: np.ndarray, values: np.ndarray, siz
                  [slice(i, i + 1) for i in range(count)])
 
 
-def _safe_triangle(gram: np.ndarray) -> np.ndarray | None:
+def safe_triangle(gram: np.ndarray) -> np.ndarray | None:
     """Upper Cholesky factor of a well-conditioned matrix, None for any other."""
     factor, failed = lapack.dpotrf(gram, lower=0, clean=1)
     if failed:
@@ -219,7 +219,7 @@ def _safe_triangle(gram: np.ndarray) -> np.ndarray | None:
     return factor if reciprocal > 1e-3 else None
 
 
-def _project(triangle: np.ndarray, table: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def project_on(triangle: np.ndarray, table: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Coordinates of y in the orthonormal basis (triangle^-T table), and the sum of squares outside of it.
 
     One step of refinement takes the rounding of the normal equations away.

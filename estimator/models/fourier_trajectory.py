@@ -208,6 +208,11 @@ class Directions:
         return Directions(self.even[:, keep[:split]], self.odd[:, keep[split:]], self.singular[keep])
 
 
+@functools.cache
+def _panel_rule() -> tuple[np.ndarray, np.ndarray]:
+    return leggauss(56)
+
+
 @functools.lru_cache(maxsize=6)
 def concentrated_directions(degree: int) -> Directions:
     """All directions of a frame of the given degree with singular values above 1e-13 of the largest.
@@ -227,7 +232,7 @@ def concentrated_directions(degree: int) -> Directions:
     frame = FourierFrame(-0.5, 0.5, degree)
     # Gauss nodes in equal panels on half of the arc, each resolving the square of the highest frequency.
     panels = 1 + degree // 40
-    nodes, weights = leggauss(56)
+    nodes, weights = _panel_rule()
     time = (np.arange(panels)[:, None] + 0.5 * (nodes + 1.0)).ravel() * (0.5 / panels)
     quadrature = np.tile(weights / (2.0 * panels), panels)
     even, odd = np.empty((time.size, degree + 1)), np.empty((time.size, degree))
