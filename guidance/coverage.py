@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from guidance.ground_geometry import EquidistantPlane, geodetic_from_earth_fixed
-from guidance.scan import Scan
+from guidance.ground_geometry import EquidistantPlane, geodetic_from_earth_fixed, nearest_intersection
+from guidance.scan import Scan, line_of_sight
 
 Array = NDArray[np.float64]
 
@@ -58,13 +58,15 @@ def outline(scan: Scan, plane: EquidistantPlane, count: int = 33, across: int = 
         across: points on the detector line at each end.
     """
     times = np.linspace(scan.start, scan.stop, count)
-    line = scan.footprint(times)
-    edges = []
-    for points in (line.left, line.right):
-        latitude, longitude, _ = geodetic_from_earth_fixed(points)
-        edges.append(np.stack(plane.to_plane(latitude, longitude), -1))
-    ends = [np.stack(plane.to_plane(*geodetic_from_earth_fixed(scan_line(scan, t, across))[:2]), -1)
-            for t in (scan.start, scan.stop)]
+    position, sight, axis = line_of_sight(scan.arc, scan.camera, times, scan.motion(times).quaternion)
+    fan = scan.camera.half_field * np.linspace(-1, 1, across)
+    which = np.concatenate([np.arange(count), np.arange(count), np.zeros(across, int), np.full(across, count - 1)])
+    tangent = np.concatenate([np.full(count, fan[0]), np.full(count, fan[-1]), fan, fan])
+    ground = nearest_intersection(position[which], sight[which] + tangent[:, None] * axis[which])
+    latitude, longitude, _ = geodetic_from_earth_fixed(ground)
+    points = np.stack(plane.to_plane(latitude, longitude), -1)
+    edges = [points[:count], points[count:2 * count]]
+    ends = [points[2 * count:2 * count + across], points[2 * count + across:]]
     if edges[0][-1, 0] + edges[1][-1, 0] < edges[0][0, 0] + edges[1][0, 0]:
         edges, ends = [e[::-1] for e in edges], ends[::-1]
     if edges[0][:, 1].mean() > edges[1][:, 1].mean():
@@ -75,9 +77,6 @@ def outline(scan: Scan, plane: EquidistantPlane, count: int = 33, across: int = 
 
 def scan_line(scan: Scan, time: float, count: int) -> Array:
     """Ground points (count, 3; Earth-fixed, m) on the detector line at one instant, from its left to its right end."""
-    from guidance.ground_geometry import nearest_intersection
-    from guidance.scan import line_of_sight
-
     position, sight, axis = line_of_sight(scan.arc, scan.camera, np.array([time]), scan.motion([time]).quaternion)
     sign = 1.0 if scan.forward != scan.turned else -1.0
     tangents = sign * scan.camera.half_field * np.linspace(-1, 1, count)

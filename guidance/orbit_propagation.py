@@ -12,6 +12,7 @@ label, as all times are elapsed seconds.
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from functools import cached_property
@@ -61,11 +62,32 @@ class EarthOrientation:
         self.outside_table = False
 
     @cached_property
-    def _table(self) -> Any:
+    def _table(self) -> Array:
+        """Days around the epoch (n, 4): modified Julian date, pole x and y (arc seconds), UT1 - UTC (s).
+
+        From the IERS file that astropy carries, as text: reading the whole of it as a table takes seconds. Values of
+        bulletin B stand where there are any, otherwise those of bulletin A.
+        """
         from astropy.utils import iers
 
-        with iers.conf.set_temp("auto_download", False), iers.conf.set_temp("iers_degraded_accuracy", "ignore"):
-            return iers.IERS_Auto.open()
+        wanted = (self.epoch - datetime(1858, 11, 17)).total_seconds() / 86400.0
+        rows: list[tuple[float, ...]] = []
+        with open(iers.IERS_A_FILE, encoding="ascii") as stream:
+            for line in stream:
+                if not line[58:68].strip():
+                    break
+                date = float(line[7:15])
+                if rows and date > wanted + 30.0:
+                    break
+                if date >= wanted - 30.0 or not rows:
+                    final = line[134:165].strip() != ""
+                    fields = (line[134:144], line[144:154], line[154:165]) if final else (line[18:27], line[37:46],
+                                                                                          line[58:68])
+                    rows.append((date, *(float(f) for f in fields)))
+                last = line
+        if rows[-1][0] < wanted:
+            rows.append((float(last[7:15]), *(float(f) for f in (last[18:27], last[37:46], last[58:68]))))
+        return np.array(sorted(set(rows)))
 
     @property
     def name(self) -> str:
@@ -79,23 +101,22 @@ class EarthOrientation:
             import erfa
             from astropy.time import Time, TimeDelta
 
-            moment = Time(self.epoch, scale="utc") + TimeDelta(index * self.knot, format="sec")
-            table = self._table
-            first, last = float(table["MJD"][0].value), float(table["MJD"][-1].value)
-            day = min(max(float(moment.utc.mjd), first + 0.01), last - 1.01)
-            if abs(day - float(moment.utc.mjd)) > 1e-9:
-                self.outside_table = True
-            # The table is read with its own UTC day, whose scale against UT1 is all that matters here.
-            ut1_minus_utc = float(table.ut1_utc(2400000.5, day).to_value("s"))
-            x, y = (float(v.to_value("rad")) for v in table.pm_xy(2400000.5, day))
-            if self.outside_table:
-                ut1_minus_utc = 0.0 if abs(ut1_minus_utc) > 0.9 else ut1_minus_utc
-            tt = moment.tt
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", erfa.ErfaWarning)  # leap seconds of years to come are not known
+                moment = Time(self.epoch, scale="utc") + TimeDelta(index * self.knot, format="sec")
+                tt, utc = moment.tt, moment.utc
+            table, day = self._table, float(utc.mjd)
+            self.outside_table |= not table[0, 0] <= day <= table[-1, 0]
+            x, y = (math.radians(float(np.interp(day, table[:, 0], table[:, k])) / 3600.0) for k in (1, 2))
+            # UT1 - UTC jumps with a leap second: take it out before interpolating.
+            steps = np.round(np.concatenate([[0.0], np.cumsum(np.round(np.diff(table[:, 3])))]))
+            smooth = float(np.interp(day, table[:, 0], table[:, 3] - steps))
+            ut1_minus_utc = smooth + float(steps[max(0, int(np.searchsorted(table[:, 0], day, side="right")) - 1)])
             intermediate = erfa.c2i06a(tt.jd1, tt.jd2)
             pole = erfa.pom00(x, y, erfa.sp00(tt.jd1, tt.jd2))
-            # UT1 = UTC + dUT1; the difference TT - UTC is that of the epoch's leap seconds, so that time flows evenly.
-            utc = moment.utc
-            ut1_1, ut1_2 = erfa.utcut1(utc.jd1, utc.jd2, ut1_minus_utc)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", erfa.ErfaWarning)
+                ut1_1, ut1_2 = erfa.utcut1(utc.jd1, utc.jd2, ut1_minus_utc)
             self._knots[index] = (intermediate, pole, float(erfa.era00(ut1_1, ut1_2)))
         return self._knots[index]
 
