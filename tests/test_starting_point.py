@@ -73,7 +73,8 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_truth_is_found(case: str) -> None:
     campaign, truth = simulate(preset("compact", **CASES[case]), seed=1 + list(CASES).index(case))
-    check(start_of(campaign, truth), truth)
+    # Three seconds of torque at 2 Hz leave little to tell the rate before them from the torque itself.
+    check(start_of(campaign, truth), truth, rate=3e-5 if case == "short pulses" else 1e-5)
 
 
 def test_design_values_far_from_the_truth_do_no_harm() -> None:

@@ -88,6 +88,8 @@ def closed_form(
         campaign: the measured data.
         variant: "literal" for the printed formulas, "corrected" for the right ones.
         velocity: whose velocity goes into (13): that of the least-squares fit, or (literal only) that of (22) and (24).
+
+    Nothing in the article is robust: gross outliers go through, and the choice of instants even looks for them.
     """
     notes: list[str] = []
     block = _trajectory(campaign)
@@ -442,8 +444,13 @@ def _actuator(campaign: Campaign, inertia: _Inertia | None, variant: Variant, no
     if torque is None or len(torque.start) == 0:
         notes.append("actuator: no torque was commanded")
         return None
-    if inertia is None or not np.all(np.isfinite(inertia.principal_from_tracker)):
+    if inertia is None:
         notes.append("actuator: (44) needs the inertia tensor, and there is none")
+        return None
+    if not np.all(np.isfinite(inertia.principal_from_tracker)):
+        notes.append(
+            "(39), (41): the printed axes are not orthogonal, and there is no quaternion; nor one of the actuators"
+        )
         return None
     torques, commands = [], []
     for start, stop, command in zip(torque.start, torque.stop, torque.command, strict=True):

@@ -813,8 +813,14 @@ def _window(dynamics: _Dynamics, arc: Arc, peak: float) -> _Window:
     return _Window(time, tracker.quaternion[first:last], tracker.standard_deviation[first:last], nodes, pulsed)
 
 
-def _errors(dynamics: _Dynamics, window: _Window, q: np.ndarray, w: np.ndarray, torque_map: np.ndarray) -> np.ndarray:
-    """Whitened attitude errors (n, m, 3), measured against predicted, of m states with torque maps (m, 3, 3)."""
+def _errors(
+    dynamics: _Dynamics, window: _Window, q: np.ndarray, w: np.ndarray, torque_map: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Whitened attitude errors of the first of m states, and their changes with the others.
+
+    Returns:
+        Measured against predicted (n, 3), and the turns of the other trajectories against the first (n, m - 1, 3).
+    """
     q, w = dynamics.run(q, w, window.nodes, torque_map)
     slope = _attitude_slope(q, w)
     cell = np.clip(np.searchsorted(window.nodes, window.time, side="right") - 1, 0, len(window.nodes) - 2)
@@ -822,11 +828,12 @@ def _errors(dynamics: _Dynamics, window: _Window, q: np.ndarray, w: np.ndarray, 
     x, h = ((window.time - window.nodes[cell]) / width)[:, None, None], width[:, None, None]
     predicted = (1 + 2 * x) * (1 - x) ** 2 * q[cell] + x * (1 - x) ** 2 * h * slope[cell]
     predicted += x**2 * (3 - 2 * x) * q[cell + 1] + x**2 * (x - 1) * h * slope[cell + 1]
-    product = (
-        Rotation.from_quat(np.repeat(window.measured, q.shape[1], axis=0), scalar_first=True)
-        * Rotation.from_quat(predicted.reshape(-1, 4), scalar_first=True).inv()
-    )
-    return product.as_rotvec().reshape(len(window.time), -1, 3) / window.sigma[:, None]
+    base = Rotation.from_quat(predicted[:, 0], scalar_first=True)
+    error = (Rotation.from_quat(window.measured, scalar_first=True) * base.inv()).as_rotvec() / window.sigma
+    # The moves are of 1e-5 rad: twice the vector part of other o first* is the turn between them.
+    other, first = predicted[:, 1:], predicted[:, :1]
+    turn = first[..., :1] * other[..., 1:] - other[..., :1] * first[..., 1:] - _cross(other[..., 1:], first[..., 1:])
+    return error, 2 * turn / window.sigma[:, None]
 
 
 def _refined(
@@ -883,9 +890,11 @@ def _refine_group(
                 maps[1:] += moves[:count, 6:].reshape(-1, 3, 3)
             tilts = Rotation.from_rotvec(np.concatenate([np.zeros((1, 3)), moves[:count, :3]]))
             starts = (tilts * Rotation.from_quat(q, scalar_first=True)).as_quat(scalar_first=True)
-            error = _errors(dynamics, window, starts, w + np.concatenate([np.zeros((1, 3)), moves[:count, 3:6]]), maps)
-            targets.append(error[:, 0].ravel())
-            jacobians.append(np.moveaxis(error[:, :1] - error[:, 1:], 1, 2).reshape(3 * len(window.time), count))
+            error, turns = _errors(
+                dynamics, window, starts, w + np.concatenate([np.zeros((1, 3)), moves[:count, 3:6]]), maps
+            )
+            targets.append(error.ravel())
+            jacobians.append(np.moveaxis(turns, 1, 2).reshape(3 * len(window.time), count))
         scale = float(np.median(np.abs(np.concatenate(targets)))) / 0.6745
         if scale < best[0]:
             best = (scale, states, torque_map)
