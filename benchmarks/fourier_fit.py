@@ -3,9 +3,9 @@
     python -m benchmarks.fourier_fit [--quick] [--repeat N]
 
 Positions of a low orbit (J2, J3, J4; integrated in inertial axes, turned to Earth-fixed ones) with 1 m white noise on
-each axis are fitted on a Fourier frame. Each method runs in a process of its own, so that its peak memory is its own (the
-interpreter, the libraries and the data, 70 MB at 864,000 samples, included). Times are medians, as ratios to three
-zero-padded real FFTs of twice the number of samples, taken in the same process between the repetitions.
+each axis are fitted on a Fourier frame. Each method runs in a process of its own, so that its peak memory is its own
+(interpreter, libraries and data included). Times are medians, as ratios to three zero-padded real FFTs of twice the
+number of samples, taken in the same process between the repetitions.
 
 Methods:
     compressed: :func:`estimator.linear_block.compress`, the product.

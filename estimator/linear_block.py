@@ -345,11 +345,14 @@ def _solve(frame: FourierFrame, cells: Cells, total_weight: float, amplitude: fl
     if rows >= columns:
         reciprocal, _ = lapack.dtrcon(triangle)
         largest = float(np.abs(triangle).sum(axis=0).max())
-        if reciprocal * largest > 10.0 * max(weakest, _RELATIVE_TOLERANCE * largest):
+        if reciprocal > 1e-5 and reciprocal * largest > 10.0 * weakest:
             return _Solution(directions, householder, lapack.dtrtri(triangle)[0], tau=tau)
-    u, singular, vt = np.linalg.svd(triangle, full_matrices=False)
+    # Weak directions are told by the size of their coefficients, not of their functions, which may live in the gaps:
+    # this is the decomposition of the frame itself on these samples.
+    u, singular, vt = np.linalg.svd(triangle * directions.singular, full_matrices=False)
     keep = singular > max(weakest, _RELATIVE_TOLERANCE * float(singular.max(initial=0.0)))
-    return _Solution(directions, np.asfortranarray(householder[:, : tau.size]), vt[keep].T / singular[keep], tau=tau,
+    right = directions.singular[:, None] * (vt[keep].T / singular[keep])
+    return _Solution(directions, np.asfortranarray(householder[:, : tau.size]), right, tau=tau,
                      left=np.ascontiguousarray(u[:, keep].T))
 
 
