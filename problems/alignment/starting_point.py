@@ -29,7 +29,7 @@ from problems.alignment.attitude_curve import AttitudeCurve, attitude_curves
 from problems.alignment.campaign import Arc, Campaign, DopplerSeries
 
 EARTH_GRAVITY = 3.986004418e14  # m3/s2
-ANTENNA_PRIOR = 0.2  # rad, weak: only what the data leave open follows the design value
+ANTENNA_PRIOR = 0.02  # rad, wide against what data determine: only what they leave open follows the design value
 INERTIA_PRIOR = 0.1  # of the trace
 TORQUE_PRIOR = 1.0  # of the design map from command to torque
 LARGEST_PRINCIPAL_MOMENT = 0.499  # of the trace; the triangle inequality allows less than one half
