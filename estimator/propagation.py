@@ -1,7 +1,7 @@
 """A state carried along an arc by its equation of motion, with its derivatives along the unknowns.
 
 The state and its sensitivities are advanced together by one compiled step function (fourth-order Runge-Kutta whose
-derivative is taken once, symbolically, for ONE step), accumulated over the nodes of the arc. Nothing is integrated
+right side is differentiated once, symbolically), accumulated over the nodes of the arc. Nothing is integrated
 again per unknown, and nothing longer than a step is ever differentiated.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from estimator.models.compiled import compiled
 from estimator.signals import Values
-from estimator.unknowns import Manifold, Unknown
+from estimator.unknowns import Manifold, UnitQuaternion, Unknown
 
 
 @dataclass(frozen=True)
@@ -52,29 +52,38 @@ class Product:
         return tuple(label for m in self.parts for label in m.labels())
 
 
-def _tangent_map(manifold: Manifold, point: ca.SX) -> ca.SX:
-    """Matrix (tangent, ambient) that takes a small ambient change at ``point`` to tangent coordinates.
+def _tangent_maps(manifold: Manifold, points: np.ndarray) -> np.ndarray:
+    """Matrices (n, tangent, ambient) that take small ambient changes at ``points`` (n, ambient) to tangent coordinates.
 
-    It is the pseudo-inverse of the Jacobian of the retraction, which has orthogonal columns of equal length for
-    vectors (1) and unit quaternions (1/2).
+    For vectors the identity. For unit quaternions twice the vector part of ``change o conjugate(point)``: a change
+    along the quaternion itself is none.
     """
-    if isinstance(manifold, Product):
-        rows, a = [], 0
-        for part in manifold.parts:
-            rows.append(_tangent_map(part, point[a : a + part.ambient]))
-            a += part.ambient
-        return ca.diagcat(*rows)
-    step = ca.SX.sym("d", manifold.tangent)
-    forward = ca.substitute(ca.jacobian(manifold.retract(point, step), step), step, ca.SX.zeros(manifold.tangent))
-    return 4 * forward.T if manifold.ambient == 4 else forward.T
+    n = len(points)
+    result = np.zeros((n, manifold.tangent, manifold.ambient))
+    row = column = 0
+    for part in manifold.parts if isinstance(manifold, Product) else (manifold,):
+        block = result[:, row : row + part.tangent, column : column + part.ambient]
+        if isinstance(part, UnitQuaternion):
+            w, x, y, z = (2 * points[:, column + i] for i in range(4))
+            block[:] = np.stack([np.stack([-x, w, -z, y], -1), np.stack([-y, z, w, -x], -1),
+                                 np.stack([-z, -y, x, w], -1)], 1)
+        else:
+            block[:] = np.eye(part.tangent)
+        row += part.tangent
+        column += part.ambient
+    return result
 
 
 class Flow:
     """The compiled step of an equation of motion, with sensitivities.
 
+    One classical Runge-Kutta step is differentiated exactly: the right side and its Jacobians along the state and the
+    unknowns are one function of small inputs, evaluated at the four stages, and the sensitivities are advanced by the
+    same combination of stages as the state.
+
     Args:
         name: a C identifier.
-        state: (name, manifold) of each part of the state.
+        state: (name, manifold) of each part of the state; vectors and unit quaternions.
         initial: which parts start at an unknown of the arc; the others start at zero and are not estimated.
         shared: unknowns in the equation of motion, common to all arcs.
         inputs: number of per-node inputs that are interpolated linearly inside a step (the environment).
@@ -86,92 +95,112 @@ class Flow:
 
     def __init__(self, name: str, state: Sequence[tuple[str, Manifold]], initial: Sequence[str],
                  shared: Sequence[Unknown], inputs: int, held: int,
-                 derivative: Callable[[dict[str, ca.SX], dict[str, ca.SX], ca.SX, ca.SX, ca.SX, float], ca.SX],
+                 derivative: Callable[[dict[str, ca.SX], dict[str, ca.SX], ca.SX, ca.SX, ca.SX, ca.SX], ca.SX],
                  substeps: int = 1):
         self.state = tuple(state)
         self.manifold = Product(tuple(m for _, m in state))
         self.initial, self.shared = tuple(initial), tuple(shared)
-        x = ca.SX.sym("x", self.manifold.ambient)
-        shared_points = [ca.SX.sym("s", u.manifold.ambient) for u in shared]
-        u0, u1, held_symbol = ca.SX.sym("u0", inputs), ca.SX.sym("u1", inputs), ca.SX.sym("h", held)
-        duration = ca.SX.sym("dt")
-        d_state = ca.SX.sym("ds", self.manifold.tangent)
-        d_shared = [ca.SX.sym("dp", u.manifold.tangent) for u in shared]
-
-        def rate(point: ca.SX, within: float, stage: float, theta: dict[str, ca.SX]) -> ca.SX:
-            parts = {}
-            a = 0
-            for label, m in self.state:
-                parts[label] = point[a : a + m.ambient]
-                a += m.ambient
-            return derivative(parts, theta, u0 + within * (u1 - u0), held_symbol, duration / substeps, stage)
-
-        def advance(point: ca.SX, theta: dict[str, ca.SX]) -> ca.SX:
-            h = duration / substeps
-            for k in range(substeps):
-                f0, fm, f1 = k / substeps, (k + 0.5) / substeps, (k + 1) / substeps
-                k1 = rate(point, f0, 0.0, theta)
-                k2 = rate(point + h / 2 * k1, fm, 0.5, theta)
-                k3 = rate(point + h / 2 * k2, fm, 0.5, theta)
-                k4 = rate(point + h * k3, f1, 1.0, theta)
-                point = point + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-            a, pieces = 0, []
-            for _, m in self.state:
-                piece = point[a : a + m.ambient]
-                pieces.append(piece / ca.sqrt(ca.sumsqr(piece)) if m.ambient == 4 and m.tangent == 3 else piece)
-                a += m.ambient
-            return ca.vertcat(*pieces)
-
-        theta = {u.name: p for u, p in zip(shared, shared_points, strict=True)}
-        theta_moved = {u.name: u.manifold.retract(p, d)
-                       for u, p, d in zip(shared, shared_points, d_shared, strict=True)}
-        after = advance(x, theta)
-        moved = advance(self.manifold.retract(x, d_state), theta_moved)
-        directions = ca.vertcat(d_state, *d_shared)
-        ambient_jacobian = ca.substitute(ca.jacobian(moved, directions), directions, ca.SX.zeros(directions.shape))
-        local = ca.mtimes(_tangent_map(self.manifold, after), ambient_jacobian)
-        t = self.manifold.tangent
         self._starts = {}
-        columns = 0
-        a = 0
+        column = row = 0
         for label, m in self.state:
             if label in self.initial:
-                self._starts[label] = (columns, a)
-                columns += m.tangent
-            a += m.tangent
-        self.initial_columns = columns
-        shared_columns = int(sum(u.manifold.tangent for u in shared))
-        self.columns = columns + shared_columns
-        sensitivity = ca.SX.sym("S", t, self.columns)
-        forced = ca.horzcat(ca.SX.zeros(t, columns), local[:, t:])
-        next_sensitivity = ca.densify(ca.mtimes(local[:, :t], sensitivity) + forced)
-        arguments = [x, sensitivity, *shared_points, u0, u1, held_symbol, duration]
-        names = ["x", "S", *(f"p{i}" for i in range(len(shared))), "u0", "u1", "held", "dt"]
-        self.step = compiled(ca.Function(f"{name}_sensitivity", arguments, [ca.densify(after), next_sensitivity], names,
-                                         ["x_next", "S_next"]))
-        self.plain = compiled(ca.Function(name, [x, *shared_points, u0, u1, held_symbol, duration],
-                                          [ca.densify(after)], ["x", *names[2:]], ["x_next"]))
+                self._starts[label] = (column, row)
+                column += m.tangent
+            row += m.ambient
+        self.initial_columns = column
+        self.columns = column + int(sum(u.manifold.tangent for u in shared))
+        right_side = self._right_side(f"{name}_right_side", inputs, held, derivative)
+        self.step = compiled(self._step(f"{name}_sensitivity", right_side, inputs, held, substeps, True))
+        self.plain = compiled(self._step(name, right_side, inputs, held, substeps, False))
         self._accumulated: dict[int, ca.Function] = {}
 
-    def initial_sensitivity(self) -> np.ndarray:
-        """Sensitivity (tangent, columns) of the state at the start of the arc."""
-        start = np.zeros((self.manifold.tangent, self.columns))
+    def _right_side(self, name: str, inputs: int, held: int, derivative: Callable[..., ca.SX]) -> ca.Function:
+        """``(x, shared..., u, held, step, fraction) -> (x', dx'/dx, dx'/d(shared tangents))``."""
+        x = ca.SX.sym("x", self.manifold.ambient)
+        points = [ca.SX.sym("p", u.manifold.ambient) for u in self.shared]
+        steps = [ca.SX.sym("d", u.manifold.tangent) for u in self.shared]
+        u, h = ca.SX.sym("u", inputs), ca.SX.sym("h", held)
+        step, fraction = ca.SX.sym("dt"), ca.SX.sym("f")
+        parts, a = {}, 0
+        for label, m in self.state:
+            parts[label] = x[a : a + m.ambient]
+            a += m.ambient
+
+        def rate(moved: bool) -> ca.SX:
+            theta = {k.name: k.manifold.retract(p, d) if moved else p
+                     for k, p, d in zip(self.shared, points, steps, strict=True)}
+            return derivative(parts, theta, u, h, step, fraction)
+
+        plain = ca.densify(rate(False))
+        slopes = ca.SX(self.manifold.ambient, 0)
+        if steps:
+            directions = ca.vertcat(*steps)
+            slopes = ca.substitute(ca.jacobian(rate(True), directions), directions, ca.SX.zeros(directions.shape))
+        # Dense outputs: CasADi then writes plain loops for the products with the sensitivities.
+        outputs = [plain, ca.densify(ca.jacobian(plain, x)), ca.densify(slopes)]
+        return ca.Function(name, [x, *points, u, h, step, fraction], outputs)
+
+    def _step(self, name: str, right_side: ca.Function, inputs: int, held: int, substeps: int,
+              sensitive: bool) -> ca.Function:
+        x0 = ca.MX.sym("x", self.manifold.ambient)
+        s0 = ca.MX.sym("S", self.manifold.ambient, self.columns)
+        points = [ca.MX.sym("p", u.manifold.ambient) for u in self.shared]
+        u0, u1, h = ca.MX.sym("u0", inputs), ca.MX.sym("u1", inputs), ca.MX.sym("h", held)
+        duration = ca.MX.sym("dt")
+        dt = duration / substeps
+        unforced = ca.MX(self.manifold.ambient, self.initial_columns)
+
+        def stage(x: ca.MX, s: ca.MX, within: float, fraction: float) -> tuple[ca.MX, ca.MX]:
+            f, along_state, along_shared = right_side.call([x, *points, u0 + within * (u1 - u0), h, dt,
+                                                            ca.MX(fraction)])
+            return f, ca.mtimes(along_state, s) + ca.horzcat(unforced, along_shared) if sensitive else s
+
+        x, s = x0, s0
+        for k in range(substeps):
+            f0, fm, f1 = k / substeps, (k + 0.5) / substeps, (k + 1) / substeps
+            k1, g1 = stage(x, s, f0, 0.0)
+            k2, g2 = stage(x + dt / 2 * k1, s + dt / 2 * g1 if sensitive else s, fm, 0.5)
+            k3, g3 = stage(x + dt / 2 * k2, s + dt / 2 * g2 if sensitive else s, fm, 0.5)
+            k4, g4 = stage(x + dt * k3, s + dt * g3 if sensitive else s, f1, 1.0)
+            x = x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            if sensitive:
+                s = s + dt / 6 * (g1 + 2 * g2 + 2 * g3 + g4)
+        pieces, a = [], 0
+        for _, m in self.state:
+            piece = x[a : a + m.ambient]
+            pieces.append(piece / ca.sqrt(ca.sumsqr(piece)) if isinstance(m, UnitQuaternion) else piece)
+            a += m.ambient
+        after = ca.densify(ca.vertcat(*pieces))
+        shared_names = [f"p{i}" for i in range(len(points))]
+        if not sensitive:
+            return ca.Function(name, [x0, *points, u0, u1, h, duration], [after],
+                               ["x", *shared_names, "u0", "u1", "held", "dt"], ["x_next"])
+        return ca.Function(name, [x0, s0, *points, u0, u1, h, duration], [after, ca.densify(s)],
+                           ["x", "S", *shared_names, "u0", "u1", "held", "dt"], ["x_next", "S_next"])
+
+    def initial_sensitivity(self, x0: np.ndarray) -> np.ndarray:
+        """Sensitivity (ambient, columns) of the state ``x0`` at the start of the arc to the arc's own unknowns."""
+        start = np.zeros((self.manifold.ambient, self.columns))
         for label, m in self.state:
             if label in self._starts:
                 column, row = self._starts[label]
-                start[row : row + m.tangent, column : column + m.tangent] = np.eye(m.tangent)
+                block = start[row : row + m.ambient, column : column + m.tangent]
+                if isinstance(m, UnitQuaternion):
+                    block[:] = _tangent_maps(m, x0[None, row : row + 4])[0].T / 4
+                else:
+                    block[:] = np.eye(m.tangent)
         return start
 
     def propagate(self, x0: np.ndarray, shared: Sequence[np.ndarray], inputs: np.ndarray, held: np.ndarray,
                   time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """States (nodes, ambient) and sensitivities (nodes, tangent, columns) at the nodes ``time``."""
+        """States (nodes, ambient) and sensitivities (nodes, ambient, columns) at the nodes ``time``."""
         steps = len(time) - 1
-        sensitivity0 = self.initial_sensitivity()
+        sensitivity0 = self.initial_sensitivity(x0)
         states = np.empty((steps + 1, self.manifold.ambient))
-        sensitivities = np.empty((steps + 1, self.manifold.tangent, self.columns))
-        states[0], sensitivities[0] = x0, sensitivity0
+        sensitivities = np.empty((steps + 1, self.columns, self.manifold.ambient))
+        states[0], sensitivities[0] = x0, sensitivity0.T
         if steps == 0:
-            return states, sensitivities
+            return states, sensitivities.transpose(0, 2, 1)
         if steps not in self._accumulated:
             if len(self._accumulated) > 16:
                 self._accumulated.clear()
@@ -184,14 +213,10 @@ class Flow:
                      np.ascontiguousarray(np.diff(time))]
         for i, argument in enumerate(arguments):
             buffer.set_arg(i, memoryview(argument) if argument.size else memoryview(np.zeros(1)))
-        out_x = np.zeros((steps, self.manifold.ambient))
-        out_s = np.zeros((steps, self.columns, self.manifold.tangent))
-        buffer.set_res(0, memoryview(out_x))
-        buffer.set_res(1, memoryview(out_s))
+        buffer.set_res(0, memoryview(states[1:]))
+        buffer.set_res(1, memoryview(sensitivities[1:]))
         trigger()
-        states[1:] = out_x
-        sensitivities[1:] = out_s.transpose(0, 2, 1)
-        return states, sensitivities
+        return states, sensitivities.transpose(0, 2, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,7 +263,8 @@ class PropagatedSignal:
             self.initial_state(values), [values[u.name] for u in self.flow.shared],
             self.inputs[:last], self.held[: last - 1], self.node_time[:last],
         )
-        return states[self.sample_nodes], sensitivities[self.sample_nodes]
+        states, sensitivities = states[self.sample_nodes], sensitivities[self.sample_nodes]
+        return states, _tangent_maps(self.manifold, states) @ sensitivities
 
     def symbolic(self, values: Mapping[str, ca.MX]) -> ca.MX:
         steps = len(self.node_time) - 1

@@ -3,8 +3,8 @@
 A state carried along a long arc with a wrong inertia tensor or a wrong rate is wrong by whole turns at its end, where
 the cost has many valleys; over the first seconds it has one. So the arcs are first cut to a short horizon, solved
 (directions that so little data leave open do not move), and lengthened step by step from the last answer. If some
-residual still is far above its noise, each quaternion that feeds it is tried from turned starts on thinned data, and
-the best is carried on.
+residual still is far above its noise, the inertia tensor is tried from the spherical one, and each quaternion that feeds
+it from turned starts on thinned data; the best is carried on.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from estimator.problem import Problem, normal_equations
 from estimator.propagation import PropagatedSignal
 from estimator.residuals import KernelResidual, Residual
 from estimator.solvers.gauss_newton import Options, solve
-from estimator.unknowns import UnitQuaternion
+from estimator.unknowns import NormalizedInertia, UnitQuaternion
 
 GROWTH = 3.0  # from one horizon to the next
 FIRST_SAMPLES = 12  # of an arc inside the first horizon
@@ -46,11 +46,17 @@ def solve_from_anywhere(problem: Problem, options: Options | None = None) -> Est
     best = solve(problem.starting_at(values), replace(options, largest_step=min(options.largest_step, 100.0)))
     if not _far(problem, best.values):
         return best
+    for u in problem.free:
+        if isinstance(u.manifold, NormalizedInertia):
+            sphere = {**problem.start, u.name: np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]) / 3}
+            again = solve(problem.starting_at(_grown(problem, sphere, coarse)), options)
+            best = min(best, again, key=_cost)
+    if not _far(problem, best.values):
+        return best
     for name in _suspects(problem, best.values):
         turned = _turned(problem, best.values, name, coarse)
         again = solve(problem.starting_at(turned), options)
-        if _cost(again) < _cost(best):
-            best = again
+        best = min(best, again, key=_cost)
     return best
 
 

@@ -126,7 +126,7 @@ def rotation_flow(commanded: bool, effects: tuple[EffectInstance, ...], trace_sc
     state = rotation_state(mine)
 
     def derivative(x: dict[str, ca.SX], theta: dict[str, ca.SX], inputs: ca.SX, held: ca.SX, step: ca.SX,
-                   fraction: float) -> ca.SX:
+                   fraction: ca.SX) -> ca.SX:
         inertia = matrix_of(theta["normalized_inertia"])
         rate, attitude = x["rate"], x["attitude"]
         pieces = [rotations.body_from_inertial_derivative(attitude, rate)]

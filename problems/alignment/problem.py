@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from estimator.effects.declaration import ENVIRONMENT, EffectInstance, Layout
-from estimator.linear_block import compress
+from estimator.linear_block import choose_degree, compress
 from estimator.losses import Loss, Quadratic
 from estimator.models.errors import RequestError, TooFewDataError
 from estimator.models.fourier_trajectory import FourierFrame
