@@ -31,10 +31,13 @@ import numpy as np
 
 from estimator.models.errors import InfeasibleError, RequestError
 from problems.star_configuration import criteria
-from problems.star_configuration.closed_form import limit_K1
+from problems.star_configuration.closed_form import least_K0_beside_fixed, least_K0_unequal, limit_K1
 
 DEFAULT_AXIS_CLEARANCE = 0.01  # rad
 """Half-angle of the cone about the axis that K1 keeps free where no limit keeps the directions apart."""
+
+_PROVEN = 1e-11
+"""Relative distance to a bound at which a value counts as having reached it."""
 
 LARGEST_COUNT = 2000
 """Directions in one problem; a larger number is a slip of the keyboard."""
@@ -49,7 +52,7 @@ _OPTIONS: dict[str, Any] = {
         "constr_viol_tol": 1e-12,
         "acceptable_tol": 1e-9,
         "max_iter": 600,
-        "mu_strategy": "adaptive",
+        "mu_strategy": "monotone",
         "bound_relax_factor": 0.0,
     },
 }
@@ -278,6 +281,22 @@ def _frame_of_axis(axis: np.ndarray) -> np.ndarray:
     return np.vstack((first, np.cross(axis, first), axis))
 
 
+def _cosine_limits(request: Request) -> tuple[float, float]:
+    """Least and greatest cosine allowed between two directions."""
+    most = 1.0 if request.minimum_angle is None else float(np.cos(request.minimum_angle))
+    least = -1.0 if request.maximum_angle is None else float(np.cos(request.maximum_angle))
+    if request.angle_limit is not None:
+        most = min(most, float(np.cos(request.angle_limit)))
+        least = max(least, -float(np.cos(request.angle_limit)))
+    return least, most
+
+
+def _all_pairs(request: Request) -> tuple[tuple[int, int], ...]:
+    """Every pair of directions, and every pair of a direction and a fixed sensor."""
+    total = request.count + len(request.fixed)
+    return tuple((i, j) for i, j in combinations(range(total), 2) if i < request.count)
+
+
 @lru_cache(maxsize=16)
 def _program(request: Request, *, elastic: bool = False) -> _Program:
     """Build the nonlinear program; with ``elastic`` the least violation of its limits is minimised instead."""
@@ -323,11 +342,7 @@ def _program(request: Request, *, elastic: bool = False) -> _Program:
         for i, j in ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)):
             require(difference[i, j], 0, 0)
 
-    most = 1.0 if request.minimum_angle is None else np.cos(request.minimum_angle)
-    least = -1.0 if request.maximum_angle is None else np.cos(request.maximum_angle)
-    if request.angle_limit is not None:
-        most = min(most, np.cos(request.angle_limit))
-        least = max(least, -np.cos(request.angle_limit))
+    least, most = _cosine_limits(request)
 
     def within(cosine: ca.SX, bottom: float, top: float) -> None:
         if top < 1:
@@ -336,11 +351,9 @@ def _program(request: Request, *, elastic: bool = False) -> _Program:
             require(cosine + margin, bottom, np.inf)
 
     if most < 1 or least > -1:
-        for i, j in combinations(range(count), 2):
-            within(ca.dot(b[:, i], b[:, j]), least, most)
-        for i in range(count):
-            for direction in fixed:
-                within(ca.dot(b[:, i], ca.DM(direction)), least, most)
+        known = [b[:, i] for i in range(count)] + [ca.DM(direction) for direction in fixed]
+        for i, j in _all_pairs(request):
+            within(ca.dot(known[i], known[j]), least, most)
     for cone in request.keep_outs:
         for i in range(count):
             within(ca.dot(b[:, i], ca.DM(cone.direction)), -1.0, float(np.cos(cone.half_angle)))
@@ -519,19 +532,58 @@ def _infeasibility(request: Request, generator: np.random.Generator, starts: int
 
 
 def _starts(request: Request, number: int, generator: np.random.Generator) -> list[np.ndarray]:
-    """Starts: all over the sphere for K0, alternately near the axis for K1."""
-    found = []
-    for k in range(number):
+    """Starts: at random for K0; for K1 packed lattices about the axis, then at random near it and anywhere."""
+    found: list[np.ndarray] = []
+    limit = request.angle_limit or request.minimum_angle
+    if request.criterion == "K1" and limit:
+        found = [_packed(request, limit, offset, generator) for offset in range(min(3, number))]
+    for k in range(number - len(found)):
         rows = random_directions(request.count, generator)
         if request.criterion == "K1" and k % 2 == 0:
             # Near the axis, in both senses, as wide as the limits need.
-            spread = max(request.clearance, (request.angle_limit or 0) * np.sqrt(request.count) / 2, 0.02)
+            spread = max(request.clearance, (limit or 0) * np.sqrt(request.count) / 2, 0.02)
             rows = np.array(request.axis) + np.tan(min(spread, 1.2)) * rows
             rows /= np.linalg.norm(rows, axis=1)[:, None]
             if request.minimum_angle is not None or k % 4 == 0:
                 rows *= generator.choice([-1.0, 1.0], size=request.count)[:, None]
         found.append(rows)
     return found
+
+
+def _packed(request: Request, limit: float, offset: int, generator: np.random.Generator) -> np.ndarray:
+    """A triangular lattice of spacing ``limit`` (rad) about the axis: the densest packing, slightly shaken.
+
+    The three offsets put a lattice point, the middle of an edge, or the middle of a triangle on the axis. Where only
+    the angle between directions counts, not that between lines, the two senses of the axis share the directions.
+    """
+    both = request.angle_limit is None and request.maximum_angle is None
+    sides = [request.count - request.count // 2, request.count // 2] if both else [request.count]
+    reach = int(np.sqrt(request.count)) + 3
+    i, j = (a.reshape(-1) for a in np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1)))
+    origin = np.array([(0.0, 0.0), (0.5, 0.0), (0.5, 0.5 / np.sqrt(3))][offset])
+    points = np.column_stack((i + 0.5 * j, np.sqrt(0.75) * j)) - origin
+    points = points[np.argsort(np.sum(points**2, axis=1), kind="stable")]
+    across = _frame_of_axis(np.array(request.axis))
+    rows = []
+    for side, number in zip((1.0, -1.0), sides, strict=False):
+        flat = 1.02 * limit * points[:number] + 0.02 * limit * generator.standard_normal((number, 2))
+        angle = np.minimum(np.linalg.norm(flat, axis=1), 1.5)
+        unit = flat / np.maximum(np.linalg.norm(flat, axis=1), 1e-12)[:, None]
+        rows.append(side * np.cos(angle)[:, None] * across[2] + (np.sin(angle)[:, None] * unit) @ across[:2])
+    return np.vstack(rows)
+
+
+def _bound(request: Request) -> float:
+    """A value that K0 cannot fall below, whatever the limits; zero where none is known."""
+    if request.criterion != "K0" or _two_axis(request) is not None:
+        return 0.0
+    sigmas = _sigmas(request)
+    if not request.fixed:
+        return least_K0_unequal(sigmas)
+    fixed = np.broadcast_to(np.asarray(request.fixed_sigma, dtype=float), (len(request.fixed),))
+    if np.ptp(np.concatenate((sigmas, fixed))) == 0:
+        return float(sigmas[0]) ** 2 * least_K0_beside_fixed(np.array(request.fixed), request.count)
+    return 0.0
 
 
 def _default_starts(request: Request) -> int:
@@ -548,7 +600,8 @@ def optimal_directions(request: Request, *, starts: int | None = None, seed: int
 
     Args:
         request: see :class:`Request`.
-        starts: number of starts; None for 3 where every local optimum is global, 12 (6 above 30 directions) elsewhere.
+        starts: number of starts; None for 3 for K0 without limits and 12 (6 above 30 directions) elsewhere, fewer once
+            a start attains a bound below which nothing lies.
         seed: of the random starts; equal seeds give equal answers.
 
     Raises:
@@ -589,7 +642,13 @@ def optimal_directions(request: Request, *, starts: int | None = None, seed: int
         )
     number = starts if starts is not None else _default_starts(request)
     generator = np.random.default_rng(seed)
-    results = [solve_from(request, start, generator) for start in _starts(request, number, generator)]
+    bound = _bound(request)
+    results: list[LocalOptimum] = []
+    for start in _starts(request, number, generator):
+        results.append(solve_from(request, start, generator))
+        if starts is None and results[-1].converged and results[-1].value <= bound * (1 + _PROVEN):
+            break  # no other start can do better
+    number = len(results)
     good = [r for r in results if r.converged]
     if not good:
         excess = _infeasibility(request, generator)
@@ -644,7 +703,9 @@ def _sentence(
         )
     if status == "unobservable":
         return "the directions allowed by the limits do not determine the attitude: a rotation about them is not seen"
-    text = f"{agreeing} of {starts} starts reached this value"
+    text = f"{agreeing} of {starts} start{'' if starts == 1 else 's'} reached this value"
+    if best.value <= _bound(request) * (1 + _PROVEN):
+        text += ", and no directions can have less (bound by majorization)"
     if converged < starts:
         text += f" ({starts - converged} did not converge)"
     if (
