@@ -105,7 +105,7 @@ def test_directions_are_the_singular_vectors_of_the_frame(degree: int) -> None:
 
 
 def test_rank_is_far_below_the_number_of_coefficients() -> None:
-    """About D + 20..40 of 2D+1 directions are above 1e-12 (ERRATA of the paper: 84 of 121, 179 of 299, 331 of 597)."""
+    """About D + 20..40 of 2D+1 directions are above 1e-12: 85 of 121, 179 of 299, 332 of 597."""
     for degree, rank in ((60, 85), (149, 179), (298, 332)):
         assert abs(concentrated_directions(degree).above(1e-12).rank - rank) <= 1
 
