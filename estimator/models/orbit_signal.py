@@ -1,0 +1,260 @@
+"""An orbit as a signal of the engine: the state at the times of the samples, with derivatives along the unknowns.
+
+An :class:`OrbitArc` holds the equations of motion, the unknowns that they depend on (position and velocity at the epoch,
+force parameters, velocity steps) and propagates once for all signals that ask at the same values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import casadi as ca
+import numpy as np
+
+from estimator.models.errors import RequestError
+from estimator.models.orbit_forces import orbital_axes
+from estimator.models.orbit_integration import DenseOrbit, Grid, Inputs, Tolerance, propagate, slope
+from estimator.models.orbit_motion import Motion
+from estimator.signals import Values
+from estimator.unknowns import Unknown, Vector
+
+_SAME_GRID = 1e-3  # relative change of the state at a segment's start up to which its grid is kept
+
+
+@dataclass(frozen=True)
+class VelocityStep:
+    """An impulsive manoeuvre.
+
+    Attributes:
+        unknown: holds (time s after the epoch of the arc's clock, radial, along-track, cross-track m/s), or the three
+            velocities alone when ``time`` is given.
+        time: s; None where the time is an unknown too.
+    """
+
+    unknown: Unknown
+    time: float | None = None
+
+    def at(self, values: Values) -> float:
+        """Time of the step, s."""
+        return float(values[self.unknown.name][0]) if self.time is None else self.time
+
+    def velocity(self, values: Values) -> np.ndarray:
+        """Radial, along-track and cross-track velocity (3,), m/s."""
+        return np.asarray(values[self.unknown.name])[-3:]
+
+
+def _stepped() -> tuple[ca.Function, ca.Function]:
+    x, dv = ca.SX.sym("x", 6), ca.SX.sym("v", 3)
+    turned = ca.mtimes(orbital_axes(x[:3], x[3:]), dv)
+    after = ca.vertcat(x[:3], x[3:] + turned)
+    return (ca.Function("after", [x, dv], [after]),
+            ca.Function("slopes", [x, dv], [ca.densify(ca.jacobian(after, x)), ca.densify(ca.jacobian(after, dv))]))
+
+
+_AFTER, _SLOPES = _stepped()
+
+
+def before_step(after: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    """State (6,) before a velocity step (3,), orbital axes of the state before it, from the state after."""
+    x = np.array(after, dtype=float)
+    for _ in range(8):
+        x[3:] += after[3:] - np.asarray(_AFTER(x, velocity)).ravel()[3:]
+    return x
+
+
+@dataclass(frozen=True, eq=False)
+class _Segment:
+    orbit: DenseOrbit
+    chain: np.ndarray  # (6, columns): derivative of the segment's initial state along the arc's unknowns
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, eq=False)
+class OrbitArc:
+    """One arc of an orbit.
+
+    Attributes:
+        name: for reports.
+        motion: equations of motion; its active accelerations are those of ``forces``.
+        inputs: what drives the motion from outside.
+        start: time of the initial state, s.
+        span: (first, last) time that will be asked for, s.
+        position, velocity: unknowns of the initial state (GCRS, m and m/s).
+        forces: (unknown, name of the acceleration) of force parameters that carry derivatives, in the order of the
+            motion's active accelerations.
+        parameters: (parameters,) values of all force parameters where no unknown gives them.
+        steps: velocity steps, in any order.
+        breaks: further times at which the equations switch (edges of burns), s.
+    """
+
+    name: str
+    motion: Motion
+    inputs: Inputs
+    start: float
+    span: tuple[float, float]
+    position: Unknown
+    velocity: Unknown
+    forces: tuple[tuple[Unknown, str], ...]
+    parameters: np.ndarray
+    steps: tuple[VelocityStep, ...] = ()
+    breaks: tuple[float, ...] = ()
+    tolerance: Tolerance = field(default_factory=Tolerance)
+    _grids: dict = field(default_factory=dict, repr=False)
+    _last: dict = field(default_factory=dict, repr=False)
+
+    @property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        return (self.position, self.velocity, *(u for u, _ in self.forces), *(s.unknown for s in self.steps))
+
+    @property
+    def columns(self) -> int:
+        return sum(u.manifold.tangent for u in self.unknowns)
+
+    def segments(self, values: Values) -> list[_Segment]:
+        """The propagated orbit at ``values``, computed once for the same values."""
+        key = tuple(np.asarray(values[u.name], dtype=float).tobytes() for u in self.unknowns)
+        if self._last.get("key") != key:
+            self._last["segments"] = self._propagated(values)
+            self._last["key"] = key
+        return self._last["segments"]
+
+    def _propagated(self, values: Values) -> list[_Segment]:
+        parameters = np.array(self.parameters, dtype=float)
+        for unknown, name in self.forces:
+            parameters[self.motion.slices[name]] = values[unknown.name]
+        x0 = np.concatenate([values[self.position.name], values[self.velocity.name]])
+        chain0 = np.zeros((6, self.columns))
+        chain0[:, :6] = np.eye(6)
+        first, last = min(self.span[0], self.start), max(self.span[1], self.start)
+        found: list[_Segment] = []
+        for direction, end in ((1, last), (-1, first)):
+            if (end - self.start) * direction > 0 or (direction == 1 and not found):
+                found += self._one_way(x0, chain0, parameters, values, direction, end)
+        return found
+
+    def _one_way(self, x: np.ndarray, chain: np.ndarray, parameters: np.ndarray, values: Values, direction: int,
+                 end: float) -> list[_Segment]:
+        def ahead(t: float) -> bool:
+            return (t - self.start) * direction > 0 and (end - t) * direction > 0
+
+        switches = sorted([(t, None) for t in self.breaks if ahead(t)]
+                          + [(s.at(values), s) for s in self.steps if ahead(s.at(values))],
+                          key=lambda item: item[0] * direction)
+        step_columns, at = {}, 6 + sum(u.manifold.tangent for u, _ in self.forces)
+        for s in self.steps:
+            step_columns[s.unknown.name] = at
+            at += s.unknown.manifold.tangent
+        force_columns = slice(6, 6 + sum(u.manifold.tangent for u, _ in self.forces))
+        segments, t = [], self.start
+        for place, switch in [*switches, (end, None)]:
+            grid = self._grid(t, place, x)
+            orbit, found = propagate(self.motion.step, self.motion.step.start(x), parameters, self.inputs,
+                                     np.array([t, place]), grid=grid, tolerance=self.tolerance)
+            if grid is None:
+                self._keep(t, place, x, found)
+            segments.append(_Segment(orbit, chain, min(t, place), max(t, place)))
+            x, carried = orbit.values[-1][:6], orbit.values[-1][6:].reshape(-1, 6).T
+            chain = carried[:, :6] @ chain
+            chain[:, force_columns] += carried[:, 6:]
+            if switch is not None:
+                velocity = switch.velocity(values)
+                u = self.inputs(np.array([place]))[0]
+                other = (np.asarray(_AFTER(x, velocity)).ravel() if direction == 1 else before_step(x, velocity))
+                earlier, later = (x, other) if direction == 1 else (other, x)
+                along_x, along_v = (np.asarray(m) for m in _SLOPES(earlier, velocity))
+                rate = [slope(self.motion.step, self.motion.step.start(y), parameters, u) for y in (earlier, later)]
+                by_time = along_x @ rate[0] - rate[1]
+                column = step_columns[switch.unknown.name]
+                if direction == -1:
+                    along_x = np.linalg.inv(along_x)
+                    along_v, by_time = -along_x @ along_v, -along_x @ by_time
+                chain = along_x @ chain
+                if switch.time is None:
+                    chain[:, column] += by_time
+                    column += 1
+                chain[:, column : column + 3] += along_v
+                x = other
+            t = place
+        return segments
+
+    def _grid(self, a: float, b: float, x: np.ndarray) -> Grid | None:
+        kept = self._grids.get((a, b))
+        if kept is None:
+            return None
+        made_for, grid = kept
+        near = (np.linalg.norm(x[:3] - made_for[:3]) < _SAME_GRID * np.linalg.norm(x[:3])
+                and np.linalg.norm(x[3:] - made_for[3:]) < _SAME_GRID * np.linalg.norm(x[3:]))
+        return grid if near else None
+
+    def _keep(self, a: float, b: float, x: np.ndarray, grid: Grid) -> None:
+        if len(self._grids) > 64:
+            self._grids.clear()
+        self._grids[a, b] = (np.array(x), grid)
+
+    def at(self, times: np.ndarray, values: Values) -> tuple[np.ndarray, np.ndarray]:
+        """States (n, 6) and derivatives (n, 6, columns) at ``times`` (n,), s; the later side at a velocity step."""
+        times = np.asarray(times, dtype=float)
+        states, derivatives = np.empty((len(times), 6)), np.zeros((len(times), 6, self.columns))
+        left = np.ones(len(times), dtype=bool)
+        segments = sorted(self.segments(values), key=lambda s: s.low)
+        width = 6 + sum(u.manifold.tangent for u, _ in self.forces)
+        for number, segment in enumerate(segments):
+            inside = left & (times < segment.high) if number + 1 < len(segments) else left
+            if not inside.any():
+                continue
+            left = left & ~inside
+            states[inside], local = segment.orbit.at(times[inside])
+            derivatives[inside] = local[:, :, :6] @ segment.chain
+            derivatives[inside, :, 6:width] += local[:, :, 6:]
+        return states, derivatives
+
+
+@dataclass(frozen=True, eq=False)
+class OrbitSignal:
+    """The state (6) of an arc at the samples' times.
+
+    Attributes:
+        name: the kernel input that it feeds.
+        arc: the orbit.
+        times: (n,) s.
+    """
+
+    name: str
+    arc: OrbitArc
+    times: np.ndarray
+
+    @property
+    def manifold(self) -> Vector:
+        return STATE
+
+    @property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        return self.arc.unknowns
+
+    def evaluate(self, values: Values) -> tuple[np.ndarray, np.ndarray]:
+        return self.arc.at(self.times, values)
+
+    def symbolic(self, values: Mapping[str, ca.MX]) -> ca.MX:
+        raise RequestError("an orbit is propagated with error control and has no single expression", where="solver",
+                           remedy="use the Gauss-Newton solver")
+
+    def subset(self, keep: np.ndarray) -> OrbitSignal:
+        return replace(self, times=self.times[keep])
+
+
+STATE = Vector(6, ("x", "y", "z", "vx", "vy", "vz"))
+"""Manifold of a celestial position and velocity."""
+
+
+def position_unknown(name: str = "position", sigma: Sequence[float] = (1e5, 1e5, 1e5)) -> Unknown:
+    """Unknown of the initial position, GCRS."""
+    return Unknown(name, Vector(3, ("x", "y", "z")), "m", tuple(sigma), frame="GCRS",
+                   description="position at the epoch")
+
+
+def velocity_unknown(name: str = "velocity", sigma: Sequence[float] = (10.0, 10.0, 10.0)) -> Unknown:
+    """Unknown of the initial velocity, GCRS."""
+    return Unknown(name, Vector(3, ("x", "y", "z")), "m/s", tuple(sigma), frame="GCRS",
+                   description="velocity at the epoch")
