@@ -51,9 +51,9 @@ undetermined by any acquisition.
 
 The squint is the angle by which the estimated mounting turns the beams out of the plane across the velocity, mean over
 all beams. Its sigma takes the errors of different estimates for independent. They are not: the *drift*, mean residual
-of the second half of a scene minus that of the first, exceeds sigma in several scenes, because the pointing really changes
-along an acquisition and because the measured Doppler depends on what is imaged; the status says where a constant
-mounting leaves the data unexplained. `unobservable` says that the turn about the velocity is not determined.
+of the second half of a scene minus that of the first, exceeds sigma in several scenes, because the pointing really
+changes along an acquisition and because the measured Doppler depends on what is imaged; the status says where a
+constant mounting leaves the data unexplained. `unobservable` says that the turn about the velocity is not determined.
 
 ## Geometry Doppler, ours minus annotated
 
@@ -128,11 +128,11 @@ def table(rows: Iterable[dict[str, Any]]) -> str:
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for r in sorted(rows, key=lambda r: (r["start"][:16], r["swath"])):
-        lines.append(
-            f"| {r['start']} | {r['mission']} | {r['swath']} {r['polarisation']} | {r['estimates']} | "
-            f"{r['rms_hz']:.2f} | {r['worst_hz']:.2f} | {r['as_processed_rms_hz']:.2f} | "
-            f"{r['as_processed_worst_hz']:.2f} | {r['measured_minus_geometry_hz']:+.1f} | {r['scatter_along_track_hz']:.1f} |"
-        )
+        cells = [r["start"], r["mission"], f"{r['swath']} {r['polarisation']}", str(r["estimates"])]
+        for name in ("rms_hz", "worst_hz", "as_processed_rms_hz", "as_processed_worst_hz"):
+            cells.append(f"{r[name]:.2f}")
+        cells += [f"{r['measured_minus_geometry_hz']:+.1f}", f"{r['scatter_along_track_hz']:.1f}"]
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
@@ -213,10 +213,15 @@ def scene_table(scenes: Iterable[dict[str, Any]]) -> str:
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for s in scenes:
-        lines.append(
-            f"| {s['scene']} | {s['swaths']} | {s['squint_mdeg']:+.2f} | {s['sigma_mdeg']:.2f} | "
-            f"{s['drift_mdeg']:+.2f} | {s['before_hz']:.1f} | {s['after_hz']:.1f} | {s['chi2_per_dof']:.2f} | {s['status']} |"
-        )
+        cells = [
+            s["scene"],
+            s["swaths"],
+            f"{s['squint_mdeg']:+.2f}",
+            f"{s['sigma_mdeg']:.2f}",
+            f"{s['drift_mdeg']:+.2f}",
+        ]
+        cells += [f"{s['before_hz']:.1f}", f"{s['after_hz']:.1f}", f"{s['chi2_per_dof']:.2f}", s["status"]]
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 

@@ -265,7 +265,7 @@ def _check_nominal(declared: np.ndarray, found: Rotation | None, where: str) -> 
     other, name = min((_angle(read(declared), found), name) for name, read in _READINGS.items())
     if other < _MOUNT_FITS:
         raise UnitError(
-            f"the design quaternion contradicts the data as declared; it looks {name.split(' (')[0]}",
+            f"the design quaternion contradicts the data as declared; it looks like {name.split(' (')[0]}",
             where=where,
             value=f"{np.rad2deg(error):.3g} deg from the data, read otherwise {np.rad2deg(other):.2g} deg",
             limit=f"{np.rad2deg(_MOUNT_FAILS):.0f} deg",
