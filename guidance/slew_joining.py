@@ -1,6 +1,6 @@
 """The slew between two given motions: a quick estimate of its time for planning, and the slew itself.
 
-The survey planner needs both through one small interface. The slew is the optimal one of :mod:`guidance.slew`; where
+The survey planner needs both through one small interface. The slew is the optimal one of :mod:`guidance.slew_optimum`; where
 that finds none, the closed-form polynomial in modified Rodrigues parameters with the least feasible time stands in.
 """
 
@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +19,9 @@ from guidance.kinematics import Motion, angle_between, conjugate, logarithm, pro
 from guidance.rodrigues_slew import RodriguesSlew, rodrigues_slew
 from guidance.slew_bounds import lower_bound
 from guidance.slew_request import Boundary, Limits, SlewRequest
+
+if TYPE_CHECKING:
+    from guidance.slew_optimum import Optimum
 
 Array = NDArray[np.float64]
 
@@ -32,6 +36,7 @@ class Join:
         angle: rad, of the rotation from the first to the last attitude.
         law: ``optimal`` or the name of the closed form.
         at: motion at times since the slew's start, s.
+        memory: what the solver can start a neighbouring slew from.
     """
 
     start: float
@@ -39,6 +44,7 @@ class Join:
     angle: float
     law: str
     at: Callable[[Array], Motion]
+    memory: Optimum | None = None
 
     @property
     def stop(self) -> float:
@@ -118,14 +124,17 @@ class Joiner:
     def __init__(self, limits: Limits, *, margin: float = 1e-6, optimal: bool = True):
         share = 1 - margin
         self.limits = Limits(limits.rate * share, limits.acceleration * share, limits.jerk * share)
-        self.optimal = optimal and optimal_slew() is not None
+        self.optimal = optimal
 
     def estimate(self, start: Motion, stop: Motion) -> float:
         """See :func:`estimated_duration`."""
         return estimated_duration(start, stop, self.limits)
 
-    def join(self, start: Motion, stop: Motion, at: float) -> Join:
+    def join(self, start: Motion, stop: Motion, at: float, near: Join | None = None) -> Join:
         """The fastest slew from the motion ``start`` to the motion ``stop``, begun at ``at`` (s from the epoch).
+
+        Args:
+            near: a slew between nearly the same motions, from which to start.
 
         Raises:
             InfeasibleError: no slew under the limits joins the two.
@@ -139,11 +148,9 @@ class Joiner:
         request = _request(start, stop, self.limits)
         angle = float(angle_between(start.quaternion, stop.quaternion))
         if self.optimal:
-            solve = optimal_slew()
-            assert solve is not None
-            found_slew = solve(request)
+            found_slew = _optimum(request, near.memory if near is not None else None)
             if found_slew is not None:
-                return Join(at, found_slew[0], angle, "optimal", found_slew[1])
+                return Join(at, found_slew.duration, angle, "optimal", found_slew.profile.motion, found_slew)
         law = _closed_form(request, self.limits)
         return Join(at, law.duration, angle, "polynomial of degree 5", law.motion)
 
@@ -151,6 +158,10 @@ class Joiner:
         """A smooth slew that takes exactly ``duration``, or None where the limits do not allow it."""
         request = _request(start, stop, self.limits)
         angle = float(angle_between(start.quaternion, stop.quaternion))
+        if self.optimal and duration < 120.0:
+            smooth = _optimum(replace(request, objective="smoothness", duration=duration), None)
+            if smooth is not None:
+                return Join(at, duration, angle, "smoothest", smooth.profile.motion)
         for degree in (7, 5):
             law = RodriguesSlew.between(request, degree)
             law = RodriguesSlew(law.reference, law.derivatives, duration)
@@ -171,6 +182,11 @@ def _closed_form(request: SlewRequest, limits: Limits) -> RodriguesSlew:
     return law
 
 
-def optimal_slew() -> Callable[[SlewRequest], tuple[float, Callable[[Array], Motion]] | None] | None:
-    """The solver of the optimal control problem as a function of a request, or None where it is not installed."""
-    return None
+def _optimum(request: SlewRequest, near: Optimum | None) -> Optimum | None:
+    """The optimal slew, or None where the solver certifies none."""
+    from guidance.slew_optimum import optimal_slew
+
+    try:
+        return optimal_slew(request, near=near)
+    except InfeasibleError:
+        return None

@@ -294,6 +294,10 @@ class Surveyor:
 
     def passes(self, latitude: float, longitude: float, reach: float) -> Iterator[Pass]:
         """Passes within ``reach`` (m) of a point, found day by day as they are asked for."""
+        inclination = self.request.orbit.inclination
+        highest = min(inclination, math.pi - inclination) + 0.005
+        if abs(latitude) > highest + 1.01 * reach / EQUATORIAL_RADIUS:
+            return
         start = -BEFORE_EPOCH
         stop = max(BEFORE_EPOCH, 1.2 * self.orbit.period)
         while start < HORIZON:
@@ -306,7 +310,7 @@ class Surveyor:
     def never_visible(self, name: str, latitude: float, longitude: float, where: str) -> GeometryError:
         """The error for a target that no pass comes near to."""
         nearest: Pass | None = None
-        for pass_ in passes_over(self.orbit, latitude, longitude, -BEFORE_EPOCH, 2 * 86400.0, 21e6):
+        for pass_ in passes_over(self.orbit, latitude, longitude, -BEFORE_EPOCH, 86400.0, 15e6):
             if nearest is None or pass_.distance < nearest.distance:
                 nearest = pass_
         found = f"{nearest.distance / 1e3:.0f} km from the nearest ground track" if nearest else "no pass"
@@ -365,12 +369,16 @@ class Surveyor:
         plans: list[AreaPlan] = []
         left: Outline | None = None
         refusal: InfeasibleError | None = None
-        tried = 0
+        tried = refused = 0
         for pass_ in self.passes(*area.center, reach):
             try:
                 azimuth = check_azimuth(area, pass_)
             except InfeasibleError as error:
-                refusal = refusal or error
+                if refusal is None or (error.excess or 0.0) < (refusal.excess or math.inf):
+                    refusal = error
+                refused += 1
+                if refused > 8 and not tried:
+                    break
                 continue
             if plane is None:
                 plane = EquidistantPlane(*area.center, azimuth)

@@ -17,14 +17,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.models.errors import BoresightError, GeometryError, InfeasibleError
-from guidance.coverage import Outline, outline, overlaps
+from guidance.coverage import Outline, outline
 from guidance.ground_geometry import EquidistantPlane, GroundLine, geodesic_inverse, wrapped
 from guidance.kinematics import Motion
 from guidance.orbit_propagation import Arc, Pass
@@ -246,9 +246,8 @@ class PassPlanner:
         """Move the strips towards the asked overlap and ends; the largest move (m) and whether the area is covered."""
         area, half = self.area, self.area.width / 2
         stations = np.linspace(-area.length / 2, area.length / 2, self.stations)
-        intervals = [s.interval(stations) for s in shapes]
-        intervals = [(np.where(np.isnan(a), (s.lower[:, 1].mean()), a), np.where(np.isnan(b), s.upper[:, 1].mean(), b))
-                     for (a, b), s in zip(intervals, shapes, strict=True)]
+        # The long edges alone: where an end cuts a footprint is the business of _needed_ends.
+        intervals = [edges_at(s, stations) for s in shapes]
         widths = [b - a for a, b in intervals]
         asked = area.overlap + OVERLAP_GUARD
 
@@ -262,7 +261,7 @@ class PassPlanner:
         if self.left is None:
             left_spare = -half - END_GUARD - float(np.max(intervals[0][0]))
         else:
-            edge = self.left.interval(stations)
+            edge = edges_at(self.left, stations)
             widest = np.maximum(edge[1] - edge[0], widths[0])
             left_spare = float(np.min(edge[1] - intervals[0][0] - asked * widest))
         right_spare = float(np.min(intervals[-1][1])) - half - END_GUARD
@@ -325,6 +324,8 @@ class PassPlanner:
         failure: BoresightError | None = None
         for pattern in self.patterns(count):
             strips = [replace(s) for s in rough[0].strips] if rough else self.guess(count, fill)
+            if len(rough) == 2 and min(p.off_nadir for p in rough) > self.limits.off_nadir + math.radians(6.0):
+                break  # far too many scans: the other patterns will not help
             try:
                 rough.append(self.simulate(pattern, strips, fill=fill, shift=shift, rounds=3 if rough else 20))
             except (InfeasibleError, GeometryError) as error:
@@ -333,7 +334,10 @@ class PassPlanner:
             assert failure is not None
             raise failure
         plans: list[AreaPlan] = []
-        for plan in sorted(rough, key=lambda p: p.stop):
+        near = [p for p in rough if p.off_nadir < self.limits.off_nadir + math.radians(3.0)]
+        if not near:
+            return min(rough, key=lambda p: p.off_nadir)
+        for plan in sorted(near, key=lambda p: p.stop):
             feasible = [p.stop for p in plans if p.feasible]
             if feasible and min(feasible) < plan.stop - 0.5:
                 break
@@ -348,7 +352,10 @@ class PassPlanner:
             raise failure
         feasible_plans = [p for p in plans if p.feasible]
         if feasible_plans:
-            return min(feasible_plans, key=lambda p: p.stop)
+            quickest = min(p.stop for p in feasible_plans)
+            # A tie goes to the plan with fewer reverse scans, then to the smaller angle off the nadir.
+            return min((p for p in feasible_plans if p.stop < quickest + 0.2),
+                       key=lambda p: (p.pattern.forward.count(False), round(math.degrees(p.off_nadir), 1), p.stop))
         return min(plans, key=lambda p: max(value / limit for value, limit in p.excess.values()))
 
     def finish(self, plan: AreaPlan, *, fill: bool, shift: float = 0.0) -> AreaPlan:
@@ -362,11 +369,11 @@ class PassPlanner:
                              coarse=False, fill=fill, shift=shift)
         strips = [replace(s) for s in fine.strips]
         begin = fine.start
-        guesses: list[float | None] = [b.start - a.stop for a, b in itertools.pairwise(fine.scans)]
+        guesses: list[float | Join] = [b.start - a.stop for a, b in itertools.pairwise(fine.scans)]
         for _ in range(8):
             placed = tuple(replace(s) for s in strips)
             scans, joins = self._with_slews(fine.pattern, strips, begin, guesses, 0.02)
-            guesses = [j.duration for j in joins]
+            guesses = list(joins)
             shapes = [outline(s, self.plane) for s in (scans if fine.pattern.from_left else scans[::-1])]
             change, complete = self._move(strips, shapes, fill)
             lag = self._lag(scans, shift)
@@ -379,7 +386,7 @@ class PassPlanner:
         return AreaPlan(fine.pattern, scans, joins, tuple(shapes), placed, complete, off_nadir,
                         excess_of_scans(scans, self.limits, off_nadir))
 
-    def _with_slews(self, pattern: Pattern, strips: list[Strip], begin: float, guesses: list[float | None],
+    def _with_slews(self, pattern: Pattern, strips: list[Strip], begin: float, guesses: Sequence[float | Join],
                     tolerance: float) -> tuple[tuple[Scan, ...], tuple[Join, ...]]:
         """Scans begun as soon as the slew from the one before allows, with those slews."""
         ordered = strips if pattern.from_left else strips[::-1]
@@ -394,6 +401,12 @@ class PassPlanner:
             joins.append(join)
             scans.append(scan)
         return tuple(scans), tuple(joins)
+
+
+def edges_at(shape: Outline, stations: Array) -> tuple[Array, Array]:
+    """Across (m) of the two long edges of a footprint at stations along, held constant beyond their ends."""
+    return (np.interp(stations, shape.lower[:, 0], shape.lower[:, 1]),
+            np.interp(stations, shape.upper[:, 0], shape.upper[:, 1]))
 
 
 def counts(width: float, narrowest: float, widest: float, overlap: float) -> ScanCount:
@@ -427,7 +440,7 @@ def excess_of_scans(scans: list[Scan], limits: LimitsRequest, off_nadir: float) 
     return found
 
 
-def soonest(joiner: Joiner, before: Scan, make: Callable[[float], Scan], *, guess: float | None = None,
+def soonest(joiner: Joiner, before: Scan, make: Callable[[float], Scan], *, guess: float | Join | None = None,
             tolerance: float = 1e-6) -> tuple[Join, Scan]:
     """The slew and the scan after it, begun as soon as the slew allows.
 
@@ -438,12 +451,14 @@ def soonest(joiner: Joiner, before: Scan, make: Callable[[float], Scan], *, gues
         joiner: makes slews.
         before: the scan that the slew leaves.
         make: the scan of a given start (s from the epoch).
-        guess: gap to begin with, s.
+        guess: gap to begin with, s, or the slew of nearly the same scans.
         tolerance: s; a microsecond or less for a plan to be flown.
     """
     end = end_of(before.motion([before.stop]))
-    gap = guess
-    if gap is None:
+    near = guess if isinstance(guess, Join) else None
+    if guess is not None:
+        gap = guess.duration if isinstance(guess, Join) else guess
+    else:
         gap = 12.0
         for _ in range(4):
             scan = make(before.stop + gap)
@@ -453,7 +468,7 @@ def soonest(joiner: Joiner, before: Scan, make: Callable[[float], Scan], *, gues
     history: list[tuple[float, float]] = []
     for _ in range(25):
         scan = make(before.stop + gap)
-        join = joiner.join(end, end_of(scan.motion([scan.start])), before.stop)
+        join = near = joiner.join(end, end_of(scan.motion([scan.start])), before.stop, near)
         miss = join.duration - gap
         if abs(miss) < tolerance:
             return _stretched(join, gap), scan

@@ -125,8 +125,10 @@ def map_figure(plan: SurveyPlan) -> Any:
     figure = Figure(figsize=(8.6, 9.4), layout="constrained")
     axes = figure.subplots()
     area = itertools.count(1)
+    seen: list[np.ndarray] = []
     for planned in plan.scans:
         x, y = degrees(*_contour(planned))
+        seen.append(np.stack([x, y], -1))
         axes.add_patch(Polygon(np.stack([x, y], -1), closed=True, facecolor=_colour(planned), alpha=0.28,
                                edgecolor=_colour(planned), linewidth=1.2))
         start, stop = (planned.scan.footprint(np.array([t])).center for t in (planned.scan.start, planned.scan.stop))
@@ -143,6 +145,7 @@ def map_figure(plan: SurveyPlan) -> Any:
         _, ground = _sight(plan, passed, times)
         x, y = degrees(*geodetic_from_earth_fixed(ground)[:2])
         axes.plot(x, y, color="0.15", linewidth=0.9, label="trace of the line of sight" if number == 0 else None)
+        seen.append(np.stack([x, y], -1))
         track = passed.arc.ground_track(times)
         x, y = degrees(track[0], track[1])
         axes.plot(x, y, color="0.45", linewidth=1.0, linestyle=":", label="ground track" if number == 0 else None)
@@ -153,12 +156,19 @@ def map_figure(plan: SurveyPlan) -> Any:
         across = np.concatenate([np.full(21, -b), b * side, np.full(21, b), -b * side])
         x, y = degrees(*planned_area.plane.to_ellipsoid(along, across))
         axes.plot(x, y, color="#8c1d40", linewidth=2.0, label="area" if index == 0 else None)
-    latitude = np.mean([s.scan.center[0] for s in plan.scans])
-    axes.set_aspect(1 / max(0.05, math.cos(latitude)))
+    latitude = float(np.mean([s.scan.center[0] for s in plan.scans]))
+    stretch = 1 / max(0.05, math.cos(latitude))
+    axes.set_aspect(stretch)
+    points = np.concatenate(seen)
+    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+    # A frame no slimmer than 1 : 1.6 around all that is seen; the rest of the ground track is cut off.
+    size = np.maximum(1.1 * (high - low), 1.1 * (high - low)[::-1] * np.array([stretch, 1 / stretch]) / 1.6)
+    middle = 0.5 * (low + high)
+    axes.set_xlim(middle[0] - size[0] / 2, middle[0] + size[0] / 2)
+    axes.set_ylim(middle[1] - size[1] / 2, middle[1] + size[1] / 2)
     axes.set_xlabel("longitude, deg")
     axes.set_ylabel("latitude, deg")
     axes.grid(alpha=0.35)
-    axes.margins(0.04)
     axes.legend(loc="best", fontsize=9)
     axes.set_title("Footprints (blue forward, green reverse, orange routes) and line of sight", fontsize=11)
     return figure
@@ -224,13 +234,12 @@ def globe(plan: SurveyPlan, *, frames: int = 160) -> Any:
         data.append(go.Scatter3d(x=contour[:, 0], y=contour[:, 1], z=contour[:, 2], mode="lines", name=label,
                                  text=[text] * len(contour), hoverinfo="text",
                                  line={"color": _colour(planned), "width": 5}))
-    for index, planned_area in enumerate(plan.areas):
+    for planned_area in plan.areas:
         a, b = planned_area.request.length / 2, planned_area.request.width / 2
         corner = planned_area.plane.to_ellipsoid([-a, a, a, -a], [-b, -b, b, b])
         box = _closed(corner[0], corner[1], 4000.0)
         data.append(go.Scatter3d(x=box[:, 0], y=box[:, 1], z=box[:, 2], mode="lines", hoverinfo="name",
                                  name=planned_area.request.name, line={"color": "#8c1d40", "width": 4}))
-        del index
     moving: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     share = max(2, frames // len(plan.passes))
     for index, passed in enumerate(plan.passes):
