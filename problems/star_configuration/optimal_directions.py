@@ -51,7 +51,7 @@ _OPTIONS: dict[str, Any] = {
         "tol": 1e-11,
         "constr_viol_tol": 1e-12,
         "acceptable_tol": 1e-9,
-        "max_iter": 600,
+        "max_iter": 300,
         "mu_strategy": "monotone",
         "bound_relax_factor": 0.0,
     },
@@ -447,7 +447,8 @@ class LocalOptimum:
     Attributes:
         directions: (count x 3), unit; ``first_axes`` as in :class:`Configuration`.
         value: the criterion, recomputed from the directions.
-        converged: the solver says so and every limit holds to 1e-8; ``word`` is what the solver said.
+        converged: the solver says so and every limit holds to 1e-8, or the value attains a proven bound; ``word`` is
+            what the solver said.
         variables, multipliers, constraints: the solver's point, for second-order analysis.
     """
 
@@ -495,11 +496,16 @@ def solve_from(request: Request, directions: np.ndarray, generator: np.random.Ge
     good = word in ("Solve_Succeeded", "Solved_To_Acceptable_Level") or (
         word == "Search_Direction_Becomes_Too_Small" and violation < 1e-9
     )
+    good = bool(good and usable and violation < 1e-8)
+    # On a flat family IPOPT may wander without end; directions that meet the limits and attain the bound are optimal
+    # whatever the solver says.
+    if usable and not good and value <= _bound(request) * (1 + _PROVEN):
+        good = meets_limits(request, rows, 1e-9)
     return LocalOptimum(
         rows,
         first_axes,
         value,
-        bool(good and usable and violation < 1e-8),
+        good,
         word,
         x,
         np.array(answer["lam_g"]).reshape(-1),
@@ -584,6 +590,28 @@ def _bound(request: Request) -> float:
     if np.ptp(np.concatenate((sigmas, fixed))) == 0:
         return float(sigmas[0]) ** 2 * least_K0_beside_fixed(np.array(request.fixed), request.count)
     return 0.0
+
+
+def meets_limits(request: Request, directions: np.ndarray, tolerance: float = 1e-7) -> bool:
+    """Whether directions (count x 3) meet every limit of the request, to ``tolerance`` in the cosines."""
+    cosines = directions @ directions.T
+    first, second = np.triu_indices(len(directions), 1)
+    pairs = cosines[first, second]
+    if request.fixed:
+        pairs = np.concatenate((pairs, (directions @ np.array(request.fixed).T).reshape(-1)))
+    if request.minimum_angle is not None and np.any(pairs > np.cos(request.minimum_angle) + tolerance):
+        return False
+    if request.maximum_angle is not None and np.any(pairs < np.cos(request.maximum_angle) - tolerance):
+        return False
+    if request.angle_limit is not None and np.any(np.abs(pairs) > np.cos(request.angle_limit) + tolerance):
+        return False
+    if request.clearance > 0 and np.any(
+        np.abs(directions @ np.array(request.axis)) > np.cos(request.clearance) + tolerance
+    ):
+        return False
+    return all(
+        np.all(directions @ np.array(c.direction) <= np.cos(c.half_angle) + tolerance) for c in request.keep_outs
+    )
 
 
 def _default_starts(request: Request) -> int:

@@ -25,6 +25,7 @@ from problems.star_configuration.optimal_directions import (
     LocalOptimum,
     Request,
     _program,
+    meets_limits,
     optimal_directions,
     random_directions,
     solve_from,
@@ -143,7 +144,8 @@ def optimal_family(request: Request, *, starts: int = 40, seed: int = 0) -> Opti
     for o in sorted((o for o in optima if o.value > value + max(tolerance, 1e-6 * value)), key=lambda o: o.value):
         if not worse or o.value > worse[-1] * (1 + 1e-6):
             worse.append(o.value)
-    lowest = min((o for o in optima if o.value <= value + tolerance), key=lambda o: o.value, default=None)
+    sound = [o for o in optima if o.value <= value + tolerance and o.word == "Solve_Succeeded"]
+    lowest = min(sound, key=lambda o: o.value, default=None)
     dimension = family_dimension(request, lowest) if lowest is not None else 0
     if dimension:
         why = (
@@ -170,25 +172,3 @@ def senses(request: Request, directions: np.ndarray, tolerance: float = 1e-7) ->
         turned = directions * np.array(signs)[:, None]
         if meets_limits(request, turned, tolerance):
             yield turned
-
-
-def meets_limits(request: Request, directions: np.ndarray, tolerance: float = 1e-7) -> bool:
-    """Whether directions (count x 3) meet every limit of the request, to ``tolerance`` in the cosines."""
-    cosines = directions @ directions.T
-    first, second = np.triu_indices(len(directions), 1)
-    pairs = cosines[first, second]
-    if request.fixed:
-        pairs = np.concatenate((pairs, (directions @ np.array(request.fixed).T).reshape(-1)))
-    if request.minimum_angle is not None and np.any(pairs > np.cos(request.minimum_angle) + tolerance):
-        return False
-    if request.maximum_angle is not None and np.any(pairs < np.cos(request.maximum_angle) - tolerance):
-        return False
-    if request.angle_limit is not None and np.any(np.abs(pairs) > np.cos(request.angle_limit) + tolerance):
-        return False
-    if request.clearance > 0 and np.any(
-        np.abs(directions @ np.array(request.axis)) > np.cos(request.clearance) + tolerance
-    ):
-        return False
-    return all(
-        np.all(directions @ np.array(c.direction) <= np.cos(c.half_angle) + tolerance) for c in request.keep_outs
-    )
