@@ -1,0 +1,180 @@
+"""What tracking data must satisfy before any orbit is fitted, and what a start tells about station and clock."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from estimator.models.earth import EQUATORIAL_RADIUS
+from estimator.models.errors import GeometryError, NotFiniteError, UnitError
+from estimator.models.ranging import COMPONENTS
+from estimator.models.station import east_north_up, station_position
+
+if TYPE_CHECKING:
+    from problems.geo_orbit.problem import OrbitModel
+
+LOWEST_RANGE = 100e3  # m, an orbit's height at the least
+HIGHEST_RANGE = 1e9  # m, beyond the Moon
+_BELOW = np.radians(-5.0)  # rad, elevation that no refraction explains
+_SCALES = {"TAI": 0.0, "GPS": -19.0, "TT": 32.184}  # s against TAI
+
+
+def check_observations(model: OrbitModel) -> None:
+    """Check every number by itself.
+
+    Raises:
+        NotFiniteError: a value is NaN or infinite.
+        UnitError: a range below an orbit's height (kilometres for metres) or beyond the Moon, an angle out of range.
+    """
+    s = model.settings
+    legs = 2.0 if s.legs == "sum" else 1.0
+    for o in model.tracking.observations:
+        model.station(o.receiver)
+        model.station(o.transmitter)
+        place = f"{o.source or 'data'}: {o.name}"
+
+        def at(row: int, o=o, place=place) -> str:  # type: ignore[no-untyped-def]
+            return place if o.line is None else f"{place}, line {int(o.line[row])}"
+
+        bad = ~np.isfinite(o.value).all(axis=1)
+        if bad.any():
+            raise NotFiniteError("a measurement is not finite", where=at(int(np.flatnonzero(bad)[0])))
+        if o.kind == "range":
+            one_way = (o.value[:, 0] - s.onboard_range_bias) / legs
+            low, high = int(np.argmin(one_way)), int(np.argmax(one_way))
+            if one_way[low] < LOWEST_RANGE:
+                raise UnitError("a range is shorter than any orbit's height", where=at(low),
+                                value=f"{o.value[low, 0]:.6g} m", limit=f"at least {LOWEST_RANGE * legs:.3g} m",
+                                remedy="check the unit of the file (metres, kilometres, seconds, range units) and "
+                                       "whether ranges are half or the sum of both legs")
+            if one_way[high] > HIGHEST_RANGE:
+                raise UnitError("a range is beyond the Moon", where=at(high), value=f"{o.value[high, 0]:.6g} m",
+                                limit=f"{HIGHEST_RANGE:.3g} m", remedy="check the unit of the file")
+        if o.kind == "azimuth_elevation":
+            off = np.abs(o.value[:, 1]) > np.pi / 2 + 1e-9
+            wide = np.abs(o.value[:, 0]) > 2 * np.pi + 1e-9
+            if (off | wide).any():
+                row = int(np.flatnonzero(off | wide)[0])
+                raise UnitError("an angle is out of its range", where=at(row),
+                                value=f"azimuth {np.degrees(o.value[row, 0]):.6g}, elevation "
+                                      f"{np.degrees(o.value[row, 1]):.6g} degrees", limit="360 and 90 degrees")
+        if o.kind == "direction_cosines" and (np.sum(o.value**2, axis=1) > 1.02).any():
+            raise UnitError("direction cosines exceed unit length", where=place)
+    _check_ranges_together(model)
+
+
+def _check_ranges_together(model: OrbitModel) -> None:
+    """Ranges below the Earth's radius for a high satellite, and pairs of ranges that break the triangle inequality."""
+    s = model.settings
+    legs = 2.0 if s.legs == "sum" else 1.0
+    ranges = [o for o in model.tracking.observations if o.kind == "range" and o.receiver == o.transmitter]
+    allowance = 100e3 + 20e3  # m: biases of equipment and motion between neighbouring time tags
+    for i, a in enumerate(ranges):
+        for b in ranges[i + 1 :]:
+            ta, tb = model.seconds(a.time), model.seconds(b.time)
+            index = np.clip(np.searchsorted(tb, ta), 1, max(len(tb) - 1, 1)) - 1
+            near = np.where(np.abs(tb[index] - ta) <= np.abs(tb[np.minimum(index + 1, len(tb) - 1)] - ta), index,
+                            np.minimum(index + 1, len(tb) - 1))
+            gap = np.abs(tb[near] - ta)
+            change = np.abs(a.value[:, 0] - b.value[near, 0]) / legs
+            p, q = model.station(a.receiver), model.station(b.receiver)
+            apart = float(np.linalg.norm(station_position(p.latitude, p.longitude, p.altitude)
+                                         - station_position(q.latitude, q.longitude, q.altitude)))
+            broken = (gap < 5.0) & (change > apart + allowance)
+            if broken.mean() > 0.5 and broken.sum() >= 3:
+                row = int(np.flatnonzero(broken)[0])
+                raise GeometryError(
+                    f"ranges of {a.receiver} and {b.receiver} at the same time differ by more than the stations are apart",
+                    where=a.source, value=f"{change[row] / 1e3:.1f} km", limit=f"{apart / 1e3:.1f} km",
+                    remedy="check the coordinates of both stations and the legs of the ranges")
+
+
+def predicted_elevations(model: OrbitModel) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Times (n,) and elevations (n,) rad of the starting orbit at every station's time tags (central field only)."""
+    result = {}
+    for o in model.tracking.observations:
+        time = model.seconds(o.time)
+        state = kepler(model.position, model.velocity, time)
+        fixed = model.environment.earth_fixed_state(time, state)[:, :3]
+        station = model.station(o.receiver)
+        line = fixed - station_position(station.latitude, station.longitude, station.altitude)
+        local = line @ east_north_up(station.latitude, station.longitude).T
+        result[f"{o.name}/{o.kind}"] = (time, np.arctan2(local[:, 2], np.hypot(local[:, 0], local[:, 1])))
+    return result
+
+
+def kepler(position: np.ndarray, velocity: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """States (n, 6) of the two-body orbit through a state at time zero, at times (n,) s (universal variables).
+
+    Source: Battin (1999), section 4.5.
+    """
+    mu = 3.986004418e14  # m3/s2
+    r0, v0 = np.asarray(position, dtype=float), np.asarray(velocity, dtype=float)
+    radius = float(np.linalg.norm(r0))
+    radial = float(r0 @ v0) / np.sqrt(mu)
+    alpha = 2 / radius - float(v0 @ v0) / mu
+    time = np.asarray(time, dtype=float)
+    chi = np.sqrt(mu) * np.abs(alpha) * time
+    for _ in range(200):
+        z = alpha * chi * chi
+        c2, c3 = _stumpff(z)
+        r = chi * chi * c2 + radial * chi * (1 - z * c3) + radius * (1 - z * c2)
+        error = (chi**3 * c3 + radial * chi**2 * c2 + radius * chi * (1 - z * c3)) - np.sqrt(mu) * time
+        step = error / r
+        chi = chi - step
+        if np.max(np.abs(step), initial=0.0) < 1e-8 * max(1.0, float(np.max(np.abs(chi), initial=1.0))):
+            break
+    z = alpha * chi * chi
+    c2, c3 = _stumpff(z)
+    f, g = 1 - chi**2 / radius * c2, time - chi**3 / np.sqrt(mu) * c3
+    place = f[:, None] * r0 + g[:, None] * v0
+    r = np.linalg.norm(place, axis=1)
+    df, dg = np.sqrt(mu) / (r * radius) * chi * (z * c3 - 1), 1 - chi**2 / r * c2
+    return np.column_stack([place, df[:, None] * r0 + dg[:, None] * v0])
+
+
+def _stumpff(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    root = np.sqrt(np.abs(z))
+    small = np.abs(z) < 1e-3
+    safe = np.where(small, 1.0, z)
+    with np.errstate(over="ignore"):
+        positive = (1 - np.cos(root)) / safe, (root - np.sin(root)) / np.where(small, 1.0, root**3)
+        negative = (1 - np.cosh(np.minimum(root, 300))) / safe, (
+            np.sinh(np.minimum(root, 300)) - root) / np.where(small, 1.0, root**3)
+    c2 = np.where(small, 1 / 2 - z / 24 + z * z / 720, np.where(z > 0, positive[0], negative[0]))
+    c3 = np.where(small, 1 / 6 - z / 120 + z * z / 5040, np.where(z > 0, positive[1], negative[1]))
+    return c2, c3
+
+
+def check_start(model: OrbitModel) -> None:
+    """Compare the data with the initial orbit that the user gave.
+
+    Raises:
+        GeometryError: a station never sees the satellite of that orbit, while it reports measurements.
+    """
+    for name, (_, elevation) in predicted_elevations(model).items():
+        station = name.split("/")[0]
+        if len(elevation) and np.mean(elevation < _BELOW) > 0.5:
+            others = [n for n, (_, e) in predicted_elevations(model).items() if np.mean(e < _BELOW) <= 0.5]
+            if others or len(model.tracking.observations) == 1:
+                place = model.station(station.split(">")[-1])
+                raise GeometryError(
+                    f"the satellite of the initial orbit is below the horizon of {station} at most of its measurements",
+                    where=name, value=f"median elevation {np.degrees(np.median(elevation)):.1f} degrees",
+                    limit="above -5 degrees",
+                    remedy=f"check latitude {np.degrees(place.latitude):.4f} and longitude "
+                           f"{np.degrees(place.longitude):.4f} degrees of the station (east positive), the initial "
+                           "orbit and the scale of the times")
+            raise GeometryError(
+                "the satellite of the initial orbit is below the horizon of every station at most of the measurements",
+                value=f"median elevation {np.degrees(np.median(elevation)):.1f} degrees at {station}",
+                limit="above -5 degrees", remedy="check the initial orbit, its epoch and the scale of the times")
+
+
+def components_of(kind: str) -> tuple[str, ...]:
+    """Names of the numbers in one measurement."""
+    return COMPONENTS[kind]
+
+
+__all__ = ["EQUATORIAL_RADIUS", "check_observations", "check_start", "components_of", "kepler", "predicted_elevations"]
