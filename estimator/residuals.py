@@ -114,6 +114,7 @@ class Kernel:
                                ["residual", *(f"j{j}" for j in range(len(steps)))])
         self.labels = labels
         self.steps = [label for label, _ in steps]
+        self.expression = function  # machine code cannot be differentiated again
         self.function = compiled(function)
         shared = tuple(f"i{labels.index(u.name)}" for u in unknowns)
         self.mapped = Mapped(self.function, shared)
@@ -129,7 +130,7 @@ class Kernel:
 
     def symbolic(self, inputs: Mapping[str, ca.MX]) -> ca.MX:
         """Residual (m, n) of mapped inputs, for solvers that differentiate by themselves."""
-        return self.function.call([inputs[label] for label in self.labels])[0]
+        return self.expression.call([inputs[label] for label in self.labels])[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,7 +247,7 @@ class KernelResidual:
             inputs[unknown.name] = ca.repmat(values[unknown.name], 1, n)
         for signal in self.signals:
             inputs[signal.name] = signal.symbolic(values)
-        raw = self.kernel.function.map(n).call([inputs[label] for label in self.kernel.labels])[0]
+        raw = self.kernel.expression.map(n).call([inputs[label] for label in self.kernel.labels])[0]
         if self.factor is None:
             raise ValueError("prepare the residual before asking for its symbolic form")
         rows = [ca.sum1(ca.DM(self.factor[:, i, :].T) * raw) for i in range(m)]

@@ -67,6 +67,7 @@ class TrajectoryResidual:
         time: (n,) s.
         values: (n, axes) measured positions.
         weights: (n, axes) inverse variances (times robust weights), zero for rejected samples.
+        standard_deviation: (n, axes) declared noise of every sample, those of zero weight too.
         effect_kernel: per-sample contribution of effects (axes), or None.
         effect_data: per-sample inputs of ``effect_kernel``.
     """
@@ -80,6 +81,7 @@ class TrajectoryResidual:
     time: np.ndarray
     values: np.ndarray
     weights: np.ndarray
+    standard_deviation: np.ndarray
     effect_kernel: Kernel | None = None
     effect_data: Mapping[str, np.ndarray] = field(default_factory=dict)
 

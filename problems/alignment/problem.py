@@ -43,6 +43,7 @@ from problems.alignment.starting_point import StartingPoint, starting_point
 
 LONGEST_STEP = 0.5  # s between nodes of a rotation arc
 ROTATION_PER_STEP = 0.02  # rad between nodes: the fourth-order step is then exact to 1e-11 rad over an arc
+HELD_OUT_BLOCK = 10  # consecutive positions that are held out together
 FEWEST_ARC_SAMPLES = 4  # star tracker samples that make a rotation arc worth its six unknowns
 
 
@@ -54,11 +55,14 @@ class AlignmentModel:
         campaign: the flight data.
         loss: robust loss of every sample.
         degree: degree of the Fourier trajectory; None chooses it from the data.
+        hold_out: fraction of every arc, its end, that is kept from the fit for proofs; of the positions, as many
+            short blocks.
     """
 
     campaign: Campaign
     loss: Loss
     degree: int | None = None
+    hold_out: float = 0.0
 
     @cached_property
     def frame(self) -> FourierFrame:
@@ -73,6 +77,7 @@ class AlignmentModel:
         """Inverse variance of each position (n, 3), times the robust weight."""
         gnss = self.campaign.gnss
         weights = np.broadcast_to(1.0 / gnss.standard_deviation**2, gnss.position.shape).copy()
+        weights[~self.used_positions] = 0.0
         if isinstance(self.loss, Quadratic):
             return weights
         robust = np.ones(len(gnss.time))
@@ -84,6 +89,22 @@ class AlignmentModel:
             if change < 1e-3:
                 break
         return weights * robust[:, None]
+
+    @cached_property
+    def used_positions(self) -> np.ndarray:
+        """Mask (n,) of the positions in the fit: all but one block in so many where data are held out."""
+        time = self.campaign.gnss.time
+        if self.hold_out <= 0:
+            return np.ones(len(time), dtype=bool)
+        step = float(np.median(np.diff(time)))
+        block = np.floor((time - time[0]) / (HELD_OUT_BLOCK * step) + 1e-9).astype(int)
+        return np.floor((block + 1) * self.hold_out) == np.floor(block * self.hold_out)
+
+    def used_of_arc(self, time: np.ndarray, start: float, stop: float) -> np.ndarray | None:
+        """Mask (n,) of an arc's samples in the fit: all but its end where data are held out, None without."""
+        if self.hold_out <= 0:
+            return None
+        return time <= stop - self.hold_out * (stop - start)
 
     @cached_property
     def block(self):  # type: ignore[no-untyped-def]
@@ -222,21 +243,26 @@ class AlignmentModel:
         return tuple(found)
 
 
-def alignment_model(campaign: Campaign, *, loss: Loss | None = None, degree: int | None = None) -> AlignmentModel:
+def alignment_model(campaign: Campaign, *, loss: Loss | None = None, degree: int | None = None,
+                    hold_out: float = 0.0) -> AlignmentModel:
     """Prepare a campaign for the joint problem.
 
     Args:
         campaign: checked flight data.
         loss: robust loss of every sample; default quadratic.
         degree: degree of the Fourier trajectory; None chooses it from the data.
+        hold_out: fraction of the data that is kept from the fit for proofs.
 
     Raises:
+        RequestError: a fraction outside 0 to 0.9.
         TooFewDataError: fewer than four positions.
     """
     if len(campaign.gnss.time) < 4:
         raise TooFewDataError("too few positions for a trajectory", where="gnss/position",
                               value=len(campaign.gnss.time), limit="at least 4")
-    return AlignmentModel(campaign, loss or Quadratic(), degree)
+    if not 0 <= hold_out <= 0.9:
+        raise RequestError("the held-out fraction makes no sense", where="hold_out", value=hold_out, limit="0 to 0.9")
+    return AlignmentModel(campaign, loss or Quadratic(), degree, hold_out)
 
 
 def alignment_problem(model: AlignmentModel, effects: Sequence[str] = (), *,
@@ -253,7 +279,8 @@ def alignment_problem(model: AlignmentModel, effects: Sequence[str] = (), *,
     """
     active = model.effect_instances(effects)
     dormant = tuple(e for e in model.effect_instances(candidates) if e not in active)
-    everything = (*active, *dormant)
+    # One order whatever is active, so that kernels are shared and found in the cache.
+    everything = tuple(sorted((*active, *dormant), key=lambda e: e.name))
     unknowns: dict[str, Unknown] = {}
     residuals: list[Residual] = []
     start: dict[str, np.ndarray] = {}
@@ -347,7 +374,8 @@ def _positions(model: AlignmentModel, effects: tuple[EffectInstance, ...]) -> Tr
         data = {"environment": model.environment(gnss.time), "attitude": quaternion, "rate": rate,
                 "inside_arc": inside * arcs}
     return TrajectoryResidual("gnss", "gnss", "m", trajectory_unknown(directions), model.block, directions, gnss.time,
-                              gnss.position, model.position_weights, kernel, data)
+                              gnss.position, model.position_weights,
+                              np.broadcast_to(gnss.standard_deviation, gnss.position.shape), kernel, data)
 
 
 def _doppler(model: AlignmentModel, effects: tuple[EffectInstance, ...],
@@ -376,7 +404,19 @@ def _doppler(model: AlignmentModel, effects: tuple[EffectInstance, ...],
     return KernelResidual(
         "doppler", "doppler", "Hz", kernel, (positions.signal("velocity", model._inside(time), 1),), data, sigma,
         time, arc, names, noise={"attitude_error": attitude.standard_deviation[index]}, loss=model.loss,
+        accepted=_used_in_sessions(model, time, arc),
     )
+
+
+def _used_in_sessions(model: AlignmentModel, time: np.ndarray, session: np.ndarray) -> np.ndarray | None:
+    if model.hold_out <= 0:
+        return None
+    used = np.ones(len(time), dtype=bool)
+    for label in np.unique(session):
+        inside = session == label
+        mask = model.used_of_arc(time[inside], float(time[inside][0]), float(time[inside][-1]))
+        used[inside] = True if mask is None else mask
+    return used
 
 
 def _rotation(model: AlignmentModel, arc: Arc, index: np.ndarray,
@@ -408,7 +448,8 @@ def _rotation(model: AlignmentModel, arc: Arc, index: np.ndarray,
         data["environment"] = model.environment(time)
     sigma = np.broadcast_to(tracker.standard_deviation, (len(tracker.time), 3))[index]
     residual = KernelResidual(f"star_tracker:{arc.name}", "star_tracker", "rad", kernel, (signal,), data, sigma, time,
-                              np.zeros(len(time), dtype=int), (arc.name,), loss=model.loss)
+                              np.zeros(len(time), dtype=int), (arc.name,), loss=model.loss,
+                              accepted=model.used_of_arc(time, float(time[0]), float(time[-1])))
     return residual, arc
 
 

@@ -1,0 +1,211 @@
+"""Where model and data disagree: channel, arcs, time scale and size, with a test that holds for any sampling.
+
+The residuals of every arc and component are projected on a few smooth functions of time (Legendre polynomials of the
+arc), with everything that the fit absorbs projected out of them first; the sum of squares is chi-square without a gap.
+Irregular sampling and gaps do not matter, and noise that is merely larger than declared is told apart from structure,
+because its scale is taken from successive differences.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial.legendre import legvander
+from scipy.stats import chi2
+
+from estimator.discrepancy.score import Stack
+from estimator.problem import Problem
+from estimator.residuals import KernelResidual, Linearization
+from estimator.trajectory_residual import TrajectoryResidual
+
+SMOOTH = 6  # Legendre polynomials per arc and component
+LEVEL = 0.01  # probability of a gap where there is none, over all places together
+
+
+@dataclass(frozen=True)
+class Place:
+    """One place of disagreement.
+
+    Attributes:
+        channel: kind of measurement.
+        arcs: names of the arcs that show it.
+        components: indices of the beams or axes that show it.
+        time_scale: s, over which the disagreement changes.
+        unit: of ``excess`` and ``floor``.
+        excess: root mean square of the structure over those arcs.
+        floor: root mean square of the noise there.
+        p_value: over all places together.
+        sentence: all this in words.
+    """
+
+    channel: str
+    arcs: tuple[str, ...]
+    components: tuple[int, ...]
+    time_scale: float
+    unit: str
+    excess: float
+    floor: float
+    p_value: float
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Gap:
+    """The verdict on the residuals of one fit.
+
+    Attributes:
+        places: structure that the model does not explain, largest p first.
+        white: (residual, factor) where white noise exceeds the declared one.
+        p_value: smallest over all tests, corrected for their number.
+    """
+
+    places: tuple[Place, ...]
+    white: tuple[tuple[str, float], ...]
+    p_value: float
+
+    @property
+    def present(self) -> bool:
+        """Whether there is structure at the stated level."""
+        return bool(self.places)
+
+
+@dataclass
+class _Cell:
+    channel: str
+    arc: str
+    component: int
+    samples: int
+    start: float
+    stop: float
+    statistic: float
+    degrees: int
+    p_value: float
+    smooth_power: float
+    dominant: int
+    floor: float
+
+
+def find_gap(problem: Problem, stacked: Stack, parts: Sequence[Linearization]) -> Gap:
+    """Test the residuals of a fit for structure.
+
+    Args:
+        problem: the accepted problem.
+        stacked: its rows at the fit.
+        parts: its linearizations at the fit.
+    """
+    cells: list[_Cell] = []
+    for residual, part in zip(problem.residuals, parts, strict=True):
+        rows = stacked.blocks[residual.name]
+        if isinstance(residual, KernelResidual):
+            cells += _kernel_cells(residual, part, rows, stacked)
+        elif isinstance(residual, TrajectoryResidual):
+            cells += _position_cells(residual, part)
+    tests = max(len(cells), 1)
+    white = tuple((name, s) for name, s in stacked.scale.items() if s > 1)
+    threshold = LEVEL / tests
+    significant = [c for c in cells if c.p_value < threshold]
+    places = []
+    for channel in dict.fromkeys(c.channel for c in significant):
+        mine = [c for c in significant if c.channel == channel]
+        everything = [c for c in cells if c.channel == channel]
+        unit = next(r.unit for r in problem.residuals if r.channel == channel)
+        places.append(_place(channel, unit, mine, everything, tests))
+    smallest = min((c.p_value for c in cells), default=1.0)
+    return Gap(tuple(sorted(places, key=lambda p: p.p_value)), white, min(1.0, smallest * tests))
+
+
+def _kernel_cells(residual: KernelResidual, part: Linearization, rows: slice, stacked: Stack) -> list[_Cell]:
+    cells = []
+    width = part.whitened.shape[1]
+    kept = part.weight > 0
+    noise = np.sqrt(np.mean(residual.standard_deviation**2, axis=0))
+    for label, name in enumerate(residual.arc_names):
+        inside = np.flatnonzero((residual.arc == label) & kept)
+        if len(inside) < 2 * SMOOTH:
+            continue
+        time = residual.time[inside]
+        start, stop = float(time[0]), float(time[-1])
+        phase = 2 * (time - start) / max(stop - start, 1e-9) - 1
+        smooth = np.linalg.qr(legvander(phase, SMOOTH - 1))[0]
+        for component in range(width):
+            columns = np.zeros((rows.stop - rows.start, SMOOTH))
+            columns[inside * width + component] = smooth
+            basis = stacked.basis[rows]
+            # The calibration's rows elsewhere matter too, so the Gram matrix of the projection is I - (Q'E)'(Q'E).
+            inner = basis.T @ columns
+            gram = np.eye(SMOOTH) - inner.T @ inner
+            gradient = columns.T @ stacked.residual[rows] - inner.T @ (stacked.basis.T @ stacked.residual)
+            eigenvalues, vectors = np.linalg.eigh(gram)
+            good = eigenvalues > 1e-6
+            amounts = (vectors[:, good].T @ gradient) / np.sqrt(eigenvalues[good])
+            statistic = float(amounts @ amounts)
+            direct = columns.T @ stacked.residual[rows]
+            cells.append(_Cell(residual.channel, name, component, len(inside), start, stop, statistic,
+                               int(good.sum()), float(chi2.sf(statistic, max(int(good.sum()), 1))),
+                               float(direct @ direct), int(np.argmax(direct**2)), float(noise[component % len(noise)])))
+    return cells
+
+
+def _position_cells(residual: TrajectoryResidual, part: Linearization) -> list[_Cell]:
+    """Stretches of the positions; what the trajectory absorbs there only makes the test more cautious."""
+    cells = []
+    used = residual.weights[:, 0] > 0
+    time = residual.time[used]
+    whitened = (part.residual / residual.standard_deviation)[used]
+    marks = _marked(residual, used)
+    for name, inside in marks:
+        if len(inside) < 4 * SMOOTH:
+            continue
+        start, stop = float(time[inside[0]]), float(time[inside[-1]])
+        phase = 2 * (time[inside] - start) / max(stop - start, 1e-9) - 1
+        smooth = np.linalg.qr(legvander(phase, SMOOTH - 1))[0]
+        for axis in range(3):
+            amounts = smooth.T @ whitened[inside, axis]
+            statistic = float(amounts @ amounts)
+            cells.append(_Cell("gnss", name, axis, len(inside), start, stop, statistic, SMOOTH,
+                               float(chi2.sf(statistic, SMOOTH)), statistic, int(np.argmax(amounts**2)),
+                               float(np.sqrt(np.mean(residual.standard_deviation[:, axis] ** 2)))))
+    return cells
+
+
+def _marked(residual: TrajectoryResidual, used: np.ndarray) -> list[tuple[str, np.ndarray]]:
+    """Stretches of the positions that are looked at: those with a known attitude where there are any, and the rest."""
+    count = int(used.sum())
+    inside = residual.effect_data.get("inside_arc")
+    if inside is None or not np.any(inside):
+        return [(f"stretch {i + 1}", piece) for i, piece in enumerate(np.array_split(np.arange(count), 24))]
+    flag = np.asarray(inside)[used] > 0
+    edges = np.flatnonzero(np.diff(flag.astype(int))) + 1
+    return [(f"arc {i + 1}" if flag[piece[0]] else f"between arcs {i + 1}", piece)
+            for i, piece in enumerate(np.split(np.arange(count), edges)) if len(piece)]
+
+
+def _place(channel: str, unit: str, cells: list[_Cell], everything: list[_Cell], tests: int) -> Place:
+    arcs = tuple(dict.fromkeys(c.arc for c in cells))
+    components = tuple(sorted({c.component for c in cells}))
+    samples = sum(c.samples for c in cells)
+    floor = float(np.sqrt(sum(c.samples * c.floor**2 for c in cells) / samples))
+    excess = float(np.sqrt(sum(max(c.smooth_power - c.degrees, 0.0) * c.floor**2 for c in cells) / samples))
+    dominant = int(np.bincount([c.dominant for c in cells]).argmax())
+    length = float(np.median([c.stop - c.start for c in cells]))
+    scale = length / dominant if dominant else max(length, float(cells[-1].stop - cells[0].start))
+    p = min(1.0, min(c.p_value for c in cells) * tests)
+    which = {"doppler": "beam", "star_tracker": "axis", "gnss": "axis"}.get(channel, "component")
+    all_components = {c.component for c in everything}
+    parts = "all " + ("beams" if which == "beam" else "axes") if set(components) == all_components else \
+        f"{which} " + ", ".join(str(c) for c in components)
+    all_arcs = {c.arc for c in everything}
+    where = "every arc" if set(arcs) == all_arcs else "arcs " + ", ".join(arcs)
+    shape = "constant within an arc" if dominant == 0 else f"changes within {scale:.3g} s"
+    value, noise, shown = _readable(excess, floor, unit)
+    sentence = f"{channel.replace('_', ' ')}, {parts}, {where}: {value:.3g} {shown} RMS over {noise:.3g} {shown}; {shape}"
+    return Place(channel, arcs, components, scale, unit, excess, floor, p, sentence)
+
+
+def _readable(excess: float, floor: float, unit: str) -> tuple[float, float, str]:
+    if unit == "rad":
+        factor = 180 / np.pi * 3600  # arcsec
+        return excess * factor, floor * factor, "arcsec"
+    return excess, floor, unit

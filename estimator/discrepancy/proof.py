@@ -1,0 +1,87 @@
+"""Proof on data that the fit never used: how far the prediction misses them, before and after an effect is added."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimator.estimate import Estimate
+from estimator.problem import Problem
+from estimator.residuals import KernelResidual, Linearization, Residual
+from estimator.trajectory_residual import TrajectoryResidual
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Misfit of one channel on held-out or on fitted samples.
+
+    Attributes:
+        channel: kind of measurement.
+        unit: of ``rms`` and ``floor``.
+        rms: root mean square of the prediction's miss, in the channel's unit, of whitened residuals times the noise.
+        floor: root mean square of the noise of those samples.
+        square: sum of whitened squares.
+        count: number of scalar measurements.
+    """
+
+    channel: str
+    unit: str
+    rms: float
+    floor: float
+    square: float
+    count: int
+
+    @property
+    def ratio(self) -> float:
+        """Miss over noise: 1 where nothing but noise is left."""
+        return float(np.sqrt(self.square / self.count)) if self.count else float("nan")
+
+
+def misfit(problem: Problem, parts: Sequence[Linearization], *, held_out: bool) -> dict[str, HeldOut]:
+    """Misfit per channel of the held-out samples, or of the fitted ones."""
+    sums: dict[str, list[tuple[float, float, int, str]]] = {}
+    for residual, part in zip(problem.residuals, parts, strict=True):
+        whitened, sigma = _samples(residual, part, held_out)
+        if whitened.size:
+            square, noise = float(np.sum(whitened**2)), float(np.sum(sigma**2))
+            sums.setdefault(residual.channel, []).append((square, noise, whitened.size, residual.unit))
+    result = {}
+    for channel, entries in sums.items():
+        square = sum(e[0] for e in entries)
+        count = sum(e[2] for e in entries)
+        floor = float(np.sqrt(sum(e[1] for e in entries) / count))
+        result[channel] = HeldOut(channel, entries[0][3], floor * float(np.sqrt(square / count)), floor, square, count)
+    return result
+
+
+def _samples(residual: Residual, part: Linearization, held_out: bool) -> tuple[np.ndarray, np.ndarray]:
+    if isinstance(residual, KernelResidual):
+        accepted = np.ones(residual.samples, dtype=bool) if residual.accepted is None else residual.accepted
+        mask = ~accepted if held_out else accepted
+        return part.whitened[mask], residual.standard_deviation[mask]
+    if isinstance(residual, TrajectoryResidual):
+        used = residual.weights[:, 0] > 0
+        mask = ~used if held_out else used
+        return (part.residual / residual.standard_deviation)[mask], residual.standard_deviation[mask]
+    return np.zeros((0, 1)), np.zeros((0, 1))
+
+
+def pays(before: Mapping[str, HeldOut], after: Mapping[str, HeldOut]) -> bool:
+    """Whether the held-out samples of all channels together are predicted better after than before."""
+    return sum(h.square for h in after.values()) < sum(h.square for h in before.values())
+
+
+def shifts(before: Estimate, after: Estimate) -> dict[str, float]:
+    """How far each asked-for unknown moved, in sigmas of the estimate after (length over all its directions)."""
+    moved = {}
+    names = {u.name for u in before.unknowns}
+    for u in after.unknowns:
+        if u.name not in names or u.nuisance:
+            continue
+        step = u.manifold.local(np.asarray(before.values[u.name]), np.asarray(after.values[u.name]))
+        covariance = after.covariance_of(u.name)
+        solved = np.linalg.lstsq(covariance, step, rcond=1e-12)[0]
+        moved[u.name] = float(np.sqrt(max(step @ solved, 0.0)))
+    return moved

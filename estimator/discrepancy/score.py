@@ -1,0 +1,281 @@
+"""Which effect: score, expected size and sigma of everything in the library, calibration unknowns projected out.
+
+For each candidate the columns B of the whitened Jacobian along its parameters, at the accepted fit, are its signature.
+What the unknowns of the fit can absorb is projected out, ``B~ = B - A (A'A)^-1 A'B``. The score
+``r'B~ (B~'B~)^-1 B~'r`` is chi-square with as many degrees of freedom as visible directions when the effect is absent.
+Effects with a searched parameter (a jump's time, a mode's frequency) have one signature per value tried.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from estimator.effects.declaration import EffectInstance
+from estimator.problem import Problem
+from estimator.residuals import Linearization
+from estimator.unknowns import Unknown, offsets
+
+INVISIBLE = 1e-8
+"""Part of a signature's squared size left after projection below which it carries no evidence (1e-4 of its size)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Signature:
+    """The columns of one candidate at one setting of its searched parameters.
+
+    Attributes:
+        effect: the candidate.
+        setting: its start values (parameters,), searched ones at the value tried.
+        ordinary: indices of the ordinary parameters, those of the columns.
+        columns: (rows, ordinary) whitened and weighted, scaled by the parameters' scales.
+        blocks: rows of each residual by name.
+    """
+
+    effect: EffectInstance
+    setting: np.ndarray
+    ordinary: np.ndarray
+    columns: np.ndarray
+    blocks: Mapping[str, slice]
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """One line of the score table.
+
+    Attributes:
+        name: of the effect's instance.
+        setting: values of all parameters at which the signature was taken.
+        score: drop of the sum of squares that the linearized effect would bring.
+        degrees: visible directions.
+        p_value: chi-square probability of such a score without the effect, before the search is accounted for.
+        size: expected values of all parameters.
+        sigma: their standard deviations (infinite where absorbed).
+        visible: part of the signature's squared size that the calibration does not absorb.
+        absorbed_by: names of the unknowns that absorb it most, where little is left.
+        evidence: log odds for the effect against the accepted model, with the declared sizes as the prior.
+        power: probability to see it at its typical size at the 1 % level.
+    """
+
+    name: str
+    setting: np.ndarray
+    score: float
+    degrees: int
+    p_value: float
+    size: np.ndarray
+    sigma: np.ndarray
+    visible: float
+    absorbed_by: tuple[str, ...]
+    evidence: float
+    power: float
+
+
+@dataclass(frozen=True, eq=False)
+class Stack:
+    """All whitened rows of a problem at one point, with the fit's columns orthonormalized.
+
+    Attributes:
+        residual: (rows,).
+        basis: (rows, p) orthonormal columns spanning the fit's Jacobian.
+        jacobian: (rows, p) the fit's Jacobian, scaled.
+        blocks: rows of each residual by name.
+        scale: factor by which each residual's noise exceeds the declared one (by name).
+    """
+
+    residual: np.ndarray
+    basis: np.ndarray
+    jacobian: np.ndarray
+    columns: tuple[Unknown, ...]
+    blocks: Mapping[str, slice]
+    scale: Mapping[str, float]
+
+    def projected(self, columns: np.ndarray) -> np.ndarray:
+        """The part of ``columns`` (rows, k) that the fit does not absorb."""
+        return columns - self.basis @ (self.basis.T @ columns)
+
+
+def rows_of(part: Linearization, unknowns: Sequence[Unknown], scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """Weighted residual rows (n m,) and Jacobian (n m, p) of one residual along ``unknowns``, in prior sigmas."""
+    root = np.sqrt(part.weight) / scale
+    residual = (part.whitened * root[:, None]).ravel()
+    columns = offsets(unknowns)
+    jacobian = np.zeros((len(residual), sum(u.manifold.tangent for u in unknowns)))
+    position = 0
+    for u in part.columns:
+        width = u.manifold.tangent
+        if u.name in columns:
+            piece = part.jacobian[:, :, position : position + width] * root[:, None, None] * u.scales
+            jacobian[:, columns[u.name]] = piece.reshape(len(residual), width)
+        position += width
+    return residual, jacobian
+
+
+def white_noise_scale(part: Linearization) -> float:
+    """Standard deviation of the whitened residual from successive differences, which smooth signatures hardly touch."""
+    kept = part.weight > 0
+    whitened = part.whitened[kept]
+    if whitened.shape[1] == 1 or len(whitened) < 20:
+        return 1.0
+    second = whitened[2:] - 2 * whitened[1:-1] + whitened[:-2]
+    centre = np.median(np.abs(second), axis=0) / 0.6745
+    return float(np.sqrt(np.mean(centre**2) / 6.0))
+
+
+def stack(problem: Problem, parts: Sequence[Linearization]) -> Stack:
+    """Stack the residuals of ``problem`` linearized at its fit.
+
+    Rows of a residual whose white noise clearly exceeds the declared one are divided by the excess, so that too small
+    a declared noise is not taken for an effect.
+    """
+    unknowns = problem.free
+    residuals, jacobians, blocks, scales, start = [], [], {}, {}, 0
+    for residual, part in zip(problem.residuals, parts, strict=True):
+        noise = white_noise_scale(part)
+        count = max(int(np.sum(part.weight > 0)) * part.whitened.shape[1], 1)
+        scales[residual.name] = noise if noise > 1 + 6 / np.sqrt(count) else 1.0
+        r, j = rows_of(part, unknowns, scales[residual.name])
+        blocks[residual.name] = slice(start, start + len(r))
+        start += len(r)
+        residuals.append(r)
+        jacobians.append(j)
+    jacobian = np.concatenate(jacobians)
+    if jacobian.shape[1] == 0:
+        return Stack(np.concatenate(residuals), jacobian, jacobian, unknowns, blocks, dict.fromkeys(scales, 1.0))
+    gram = jacobian.T @ jacobian
+    eigenvalues, vectors = np.linalg.eigh(gram)
+    kept = eigenvalues > max(1e-14 * eigenvalues[-1], 1e-12)
+    basis = jacobian @ (vectors[:, kept] / np.sqrt(eigenvalues[kept]))
+    return Stack(np.concatenate(residuals), basis, jacobian, unknowns, blocks, scales)
+
+
+def signature(stacked: Stack, problem: Problem, parts: Sequence[Linearization], effect: EffectInstance,
+              setting: np.ndarray) -> Signature:
+    """The columns of one candidate, on the rows of ``stacked``.
+
+    Args:
+        stacked: rows of the accepted fit.
+        problem: a problem with the candidate in its kernels; residuals are matched by name and size.
+        parts: its linearizations with the candidate at ``setting``.
+        effect: the candidate.
+        setting: start values of the candidate's parameters.
+    """
+    ordinary = np.array([i for i, p in enumerate(effect.parameters) if p.search is None], dtype=int)
+    unknown = problem.unknown(effect.name)
+    columns = np.zeros((len(stacked.residual), len(effect.parameters)))
+    for residual, part in zip(problem.residuals, parts, strict=True):
+        if all(u.name != effect.name for u in residual.unknowns) or residual.name not in stacked.blocks:
+            continue
+        rows = stacked.blocks[residual.name]
+        _, block = rows_of(part, (unknown,), stacked.scale[residual.name] if stacked.jacobian.size else 1.0)
+        if rows.stop - rows.start == len(block):
+            columns[rows] = block
+    return Signature(effect, setting, ordinary, columns[:, ordinary], stacked.blocks)
+
+
+def on_rows(candidate: Signature, stacked: Stack) -> Signature:
+    """The same signature on the rows of another stack; residuals are matched by name."""
+    columns = np.zeros((len(stacked.residual), candidate.columns.shape[1]))
+    for name, rows in candidate.blocks.items():
+        if name in stacked.blocks:
+            columns[stacked.blocks[name]] = candidate.columns[rows] / stacked.scale[name]
+    return Signature(candidate.effect, candidate.setting, candidate.ordinary, columns, stacked.blocks)
+
+
+def scored(stacked: Stack, candidate: Signature, projected: np.ndarray | None = None) -> Score:
+    """Score one candidate at one setting."""
+    columns = candidate.columns
+    left = stacked.projected(columns) if projected is None else projected
+    raw = columns.T @ columns
+    matrix = left.T @ left
+    gradient = left.T @ stacked.residual
+    scales = np.array([candidate.effect.parameters[i].scale for i in candidate.ordinary])
+    size_raw = np.sqrt(np.maximum(np.diag(raw), 1e-300))
+    relative = matrix / np.outer(size_raw, size_raw)
+    eigenvalues, vectors = np.linalg.eigh(relative)
+    visible = (eigenvalues > INVISIBLE) & (eigenvalues > 0)
+    # A direction whose whole signature at a typical size stays below a hundredth of a sigma carries nothing either.
+    strength = np.array([float((v / size_raw) @ matrix @ (v / size_raw)) / max(float(np.sum((v / size_raw) ** 2)), 1e-300)
+                         for v in vectors.T])
+    visible &= strength > 1e-4
+    degrees = int(visible.sum())
+    size = np.array(candidate.setting, dtype=float)
+    sigma = np.full(len(size), np.inf)
+    if degrees == 0:
+        return Score(candidate.effect.name, candidate.setting, 0.0, 0, 1.0, size, sigma, 0.0,
+                     _absorbers(stacked, columns), -np.inf, 0.0)
+    back = vectors[:, visible] / size_raw[:, None]
+    inverse = (back / eigenvalues[visible]) @ back.T
+    step = -inverse @ gradient
+    score = float(gradient @ inverse @ gradient)
+    size[candidate.ordinary] += step * scales
+    spread = np.sqrt(np.diag(inverse)) * scales
+    hidden = vectors[:, ~visible]
+    exposed = np.sum(hidden**2, axis=1) < 1e-6 if hidden.size else np.ones(len(spread), dtype=bool)
+    sigma[candidate.ordinary] = np.where(exposed, spread, np.inf)
+    share = float(np.trace(matrix) / max(np.trace(raw), 1e-300))
+    evidence = log_evidence(candidate.effect, candidate.ordinary, matrix, -gradient)
+    typical = float(np.trace(matrix)) / len(scales)
+    power = float(1 - _noncentral(chi2.ppf(0.99, degrees), degrees, typical))
+    return Score(candidate.effect.name, candidate.setting, score, degrees, float(chi2.sf(score, degrees)), size, sigma,
+                 share, _absorbers(stacked, columns) if share < 1e-3 else (), evidence, power)
+
+
+def log_evidence(effect: EffectInstance, ordinary: np.ndarray, information: np.ndarray, gradient: np.ndarray) -> float:
+    """Log odds of the linear effect against none, Gaussian prior of the declared sizes, in units of scales.
+
+    Args:
+        effect: with its parameters' scales (prior sigma) and nominal values.
+        ordinary: indices of the parameters of the columns.
+        information: (k, k) projected information in units of scales.
+        gradient: (k,) projected ``B~'(-r)``.
+    """
+    centre = np.array([(effect.parameters[i].nominal or 0.0) / effect.parameters[i].scale for i in ordinary])
+    width = np.array([_prior_width(effect, int(i)) for i in ordinary])
+    shifted = gradient - information @ centre
+    fixed = float(gradient @ centre - 0.5 * centre @ information @ centre)
+    inner = np.eye(len(width)) + information * np.outer(width, width)
+    solved = np.linalg.solve(inner, width * shifted)
+    _, determinant = np.linalg.slogdet(inner)
+    return fixed + 0.5 * float((width * shifted) @ solved) - 0.5 * float(determinant)
+
+
+def _prior_width(effect: EffectInstance, index: int) -> float:
+    """Prior sigma of a parameter in units of its scale: a few per cent of a known size, a few typical sizes else."""
+    parameter = effect.parameters[index]
+    if parameter.nominal is not None:
+        return 0.02 * abs(parameter.nominal) / parameter.scale
+    return 3.0
+
+
+def _noncentral(threshold: float, degrees: int, shift: float) -> float:
+    from scipy.stats import ncx2
+
+    return float(ncx2.cdf(threshold, degrees, min(shift, 1e4)))
+
+
+def _absorbers(stacked: Stack, columns: np.ndarray) -> tuple[str, ...]:
+    """Unknowns of the fit whose movement imitates the signature most, largest first."""
+    gram = stacked.jacobian.T @ stacked.jacobian
+    regular = gram + 1e-12 * np.trace(gram) / len(gram) * np.eye(len(gram))
+    solution = np.linalg.solve(regular, stacked.jacobian.T @ columns)
+    moved = {u.name: float(np.linalg.norm(stacked.jacobian[:, c] @ solution[c]))
+             for u, c in zip(stacked.columns, offsets(stacked.columns).values(), strict=True)}
+    largest = max(moved.values(), default=0.0)
+    return tuple(k for k, v in sorted(moved.items(), key=lambda item: -item[1]) if v > 0.1 * largest)[:4]
+
+
+def settings(effect: EffectInstance) -> list[np.ndarray]:
+    """Start values to try: one for an ordinary effect, the grid of the searched parameters else."""
+    grids = []
+    for p in effect.parameters:
+        if p.search is None:
+            grids.append([0.0])
+        else:
+            low, high, number, kind = p.search
+            values = np.geomspace(low, high, number) if kind == "logarithmic" else np.linspace(low, high, number)
+            grids.append(list(values))
+    mesh = np.meshgrid(*grids, indexing="ij")
+    return [np.array(v) for v in zip(*(m.ravel() for m in mesh), strict=True)]

@@ -1,0 +1,23 @@
+"""What the workflow needs from a problem: to be made with given effects, and to say which effects there are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from estimator.effects.declaration import EffectInstance
+from estimator.problem import Problem
+
+
+class Subject(Protocol):
+    """A system under investigation."""
+
+    @property
+    def library(self) -> tuple[EffectInstance, ...]:
+        """Every effect that may be named, instances of a family one by one."""
+
+    def problem(self, effects: Sequence[str], candidates: Sequence[str], *, hold_out: bool) -> Problem:
+        """The joint problem with ``effects`` estimated and ``candidates`` in the kernels, held at zero.
+
+        With ``hold_out`` a part of every arc is kept from the fit: its samples stay in the residuals with no weight.
+        """
