@@ -77,6 +77,7 @@ class JerkProfile:
         """
         times = np.asarray(times, dtype=float)
         joints, rates, accelerations = self.nodes()
+        longest_step = max(longest_step, 1e-5 * joints[-1])
         count = int(np.ceil(joints[-1] / longest_step)) + 1
         grid = np.unique(np.concatenate([joints, np.linspace(0, joints[-1], count), np.clip(times, 0, joints[-1])]))
 
@@ -98,7 +99,7 @@ class JerkProfile:
 
     def final(self) -> tuple[Array, Array, Array]:
         """Quaternion, rate and acceleration at the end."""
-        m = self.motion(np.array([self.duration]))
+        m = self.motion(np.array([self.duration]), longest_step=0.2)
         return m.quaternion[0], m.rate[0], m.acceleration[0]
 
     def largest(self) -> tuple[float, float, float]:
@@ -109,19 +110,19 @@ class JerkProfile:
         """
         _, rates, accelerations = self.nodes()
         w, a, j = rates[:-1], accelerations[:-1], self.jerks
-        candidates = [norm(rates)]
-        # (|w + a s + j s^2 / 2|^2)' / 2 = w.a + (a.a + w.j) s + 3/2 a.j s^2 + 1/2 j.j s^3
-        cubics = np.stack([np.sum(j * j, 1) / 2, 1.5 * np.sum(a * j, 1), np.sum(a * a, 1) + np.sum(w * j, 1),
-                           np.sum(w * a, 1)], axis=1)
-        for k, cubic in enumerate(cubics):
-            if self.durations[k] <= 0:
-                continue
-            h = self.durations[k]
-            roots = np.roots(cubic * h ** np.arange(3, -1, -1)) if np.any(cubic) else np.zeros(0)
-            s = roots.real[(np.abs(roots.imag) < 1e-6) & (roots.real > 0) & (roots.real < 1)][:, None] * h
+        highest = float(np.max(norm(rates)))
+        h = self.durations[:, None]
+        # The rate lies in the hull of its control points: only pieces whose hull reaches higher are looked into.
+        hull = np.maximum(norm(w + h * a / 2), norm(rates[1:]))
+        for k in np.flatnonzero((hull > highest) & (self.durations > 0)):
+            # (|w + a s + j s^2 / 2|^2)' / 2 = w.a + (a.a + w.j) s + 3/2 a.j s^2 + 1/2 j.j s^3
+            length = self.durations[k]
+            cubic = np.array([j[k] @ j[k] / 2 * length**3, 1.5 * (a[k] @ j[k]) * length**2,
+                              (a[k] @ a[k] + w[k] @ j[k]) * length, w[k] @ a[k]])
+            roots = np.roots(cubic)
+            s = roots.real[(np.abs(roots.imag) < 1e-6) & (roots.real > 0) & (roots.real < 1)][:, None] * length
             if len(s):
-                candidates.append(norm(w[k] + s * a[k] + s * s / 2 * j[k]))
+                highest = max(highest, float(np.max(norm(w[k] + s * a[k] + s * s / 2 * j[k]))))
         used = self.durations > 0
         jerk = norm(self.jerks[used])
-        return (float(np.max(np.concatenate(candidates))), float(np.max(norm(accelerations))),
-                float(np.max(jerk, initial=0.0)))
+        return highest, float(np.max(norm(accelerations))), float(np.max(jerk, initial=0.0))

@@ -36,6 +36,9 @@ Array = np.ndarray
 
 _MARGIN = 2e-7  # relative: the limits inside the solver, so that its tolerance does not break them outside
 _PERMITTED = 1e-6  # relative: the most that a certified slew may exceed a limit
+_NEAR_PROFILE, _NEARER = 0.006, 0.002  # relative: an optimum this near the eigenaxis profile has its switches
+# (the second number where the ends accelerate)
+_FINE, _REFINEMENTS, _SETTLED = 40, 3, 1.5e-4  # intervals of the refined mesh, most refinements, relative gain to stop at
 _LAST_PIECE = 1e-3  # of the time to build up the acceleration: length of the piece with the jerk asked for at the stop
 
 
@@ -194,7 +197,7 @@ def _closed(profile: JerkProfile, request: SlewRequest) -> JerkProfile:
         missing = np.concatenate([
             _small_rotation(motion.quaternion[-1], request.stop.quaternion),
             request.stop.rate - motion.rate[-1], request.stop.acceleration - motion.acceleration[-1]])
-        if np.max(np.abs(missing)) < 1e-13 or np.max(np.abs(missing)) > 1e-4:
+        if np.max(np.abs(missing)) < 1e-11 or np.max(np.abs(missing)) > 1e-4:
             break
         # A change of jerk in piece k changes the rate at t by (t - t_k) h, and that turns the end by its integral
         # seen from the body at the end.
@@ -206,7 +209,8 @@ def _closed(profile: JerkProfile, request: SlewRequest) -> JerkProfile:
                   for k in range(len(h))]
         matrix = np.concatenate(blocks, axis=1)
         weight = np.array([1.0] * 3 + [total] * 3 + [total**2] * 3)
-        change, *_ = np.linalg.lstsq(matrix * weight[:, None], missing * weight, rcond=None)
+        weighted = matrix * weight[:, None]
+        change = weighted.T @ np.linalg.lstsq(weighted @ weighted.T, missing * weight, rcond=1e-14)[0]
         profile = replace(profile, jerks=profile.jerks + change.reshape(-1, 3))
     return profile
 
@@ -256,15 +260,15 @@ def _refined(attempt: _Attempt, limits: Limits, count: int) -> tuple[Array, Arra
     return np.diff(new), state[:, 0:3] * s.angle, state[:, 3:6] * s.rate, state[:, 6:9] * s.acceleration
 
 
-def _one_way(request: SlewRequest, limits: Limits, envelope: Envelope, long_way: bool, bound: float, name: str,
-             steps: list[str]) -> tuple[_Attempt | None, int]:
+def _one_way(request: SlewRequest, limits: Limits, envelope: Envelope, long_way: bool, name: str, steps: list[str]) \
+        -> tuple[_Attempt | None, int]:
     """The best answer of one way round and the iterations spent; the last failure where there is none."""
     axis, speed = eigenaxis_profile(request, limits, long_way)
     label = "long way" if long_way else "short way"
-    across = max(float(np.linalg.norm(e.rate - (e.rate @ axis) * axis)) for e in (request.start, request.stop))
+    plain = speed.fits and not envelope.extras.rows and request.objective == "time"
+    alone = not any(np.linalg.norm(v - (v @ axis) * axis) > 1e-12 * limits.rate for e in (request.start, request.stop)
+                    for v in (e.rate, e.acceleration))
     still = not (np.any(request.start.acceleration) or np.any(request.stop.acceleration))
-    plain = (speed.fits and still and across < 0.35 * limits.rate and not envelope.extras.rows
-             and request.objective == "time" and speed.durations[1] + speed.durations[5] > 0.2 * speed.duration)
     spent, best = 0, None
 
     def attempt(what: str, *args: Any, **options: Any) -> _Attempt:
@@ -281,25 +285,31 @@ def _one_way(request: SlewRequest, limits: Limits, envelope: Envelope, long_way:
         return result
 
     options: dict[str, Any] = {"name": name}
+    if name == "ipopt":
+        options["ipopt.mu_init"] = 1e-3
     if speed.fits and speed.duration > 0:
-        mesh = switching_mesh(speed, limits, (1, 3, 4, 5) if plain else (3, 5, 5, 7))
+        mesh = switching_mesh(speed, limits, exact=alone)
         first = attempt("from the eigenaxis profile", mesh, *starting_motion(request, axis, speed, mesh), **options)
-        if plain and first.success:
+        if plain and first.success and abs(first.duration / speed.duration - 1) < (_NEAR_PROFILE if still else _NEARER):
             return first, spent
-    if not plain:
+    if best is None or not best.success or not plain:
+        bound = max(lower_bound(request, limits, long_way=long_way), 1e-3)
         start = _uniform_start(request, limits, long_way, bound, 32)
         if start is not None:
-            attempt("from the polynomial", *start, **options)
+            attempt("from the polynomial", *start, name=name)
         if best is None or not best.success:
             duration = 2 * max(bound, speed.duration, 1e-3)
             mesh = np.full(32, 1 / 32)
             sigma, rate, acceleration, _ = starting_motion(request, axis, replace(
                 speed, durations=np.maximum(speed.durations, duration / 7)), mesh)
-            attempt("from a slower start", mesh, sigma, rate, acceleration, duration, **options)
+            attempt("from a slower start", mesh, sigma, rate, acceleration, duration, name=name)
     if best is not None and best.success:
-        for count in (44,):
-            fractions, sigma, rate, acceleration = _refined(best, limits, count)
+        for _ in range(_REFINEMENTS):
+            before = best.duration
+            fractions, sigma, rate, acceleration = _refined(best, limits, _FINE)
             attempt("on a refined mesh", fractions, sigma, rate, acceleration, best.duration, **options)
+            if best.duration > before * (1 - _SETTLED):
+                break
     return best, spent
 
 
@@ -330,12 +340,11 @@ def optimal_slew(request: SlewRequest, *, near: Optimum | None = None) -> Optimu
     best_way, total = False, 0
     failures: list[_Attempt] = []
     for long_way in (False, True):
-        bound = lower_bound(inner, limits, long_way=long_way)
-        if best is not None and bound >= best.duration:
+        if best is not None and lower_bound(inner, limits, long_way=True) >= best.duration:
             continue
         if long_way and inner.objective == "smoothness" and best is not None:
             continue
-        found, spent = _one_way(inner, limits, envelope, long_way, max(bound, 1e-3), name, steps)
+        found, spent = _one_way(inner, limits, envelope, long_way, name, steps)
         total += spent
         if found is None:
             continue
