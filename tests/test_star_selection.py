@@ -84,6 +84,35 @@ def test_branch_and_bound_is_exact(
     assert tried >= 6
 
 
+def test_branch_and_bound_is_exact_on_odd_geometries(monkeypatch: pytest.MonkeyPatch) -> None:
+    """60 problems: whole sphere, narrow bundles and near-parallel clusters, one to three cameras, any quotas."""
+    monkeypatch.setattr(selection, "_ENUMERATED", 1)
+    generator = np.random.default_rng(5)
+    for trial in range(60):
+        count, cameras = int(generator.integers(3, 11)), int(generator.integers(1, 4))
+        b = generator.standard_normal((count, 3))
+        if trial % 3 == 1:
+            b = np.array([0, 0, 1]) + 0.1 * b
+        elif trial % 3 == 2:
+            b = np.round(b) + 1e-3 * generator.standard_normal((count, 3))
+        b /= np.linalg.norm(b, axis=1)[:, None]
+        sigma = generator.uniform(0.3, 3, count) if trial % 2 else np.ones(count)
+        information = selection._sighting_information(b, sigma, Camera((0, 0, 1), 1.0))
+        camera = generator.integers(0, cameras, count)
+        quotas = tuple(int(q) for q in generator.integers(1, 6, cameras))
+        candidates = Candidates(b, information, camera, np.arange(count), sigma, quotas)
+        size = min(
+            int(generator.integers(2, count + 1)), sum(min(np.sum(camera == i), q) for i, q in enumerate(quotas))
+        )
+        criterion = ("K0", "K1")[trial % 2]
+        chosen = select(candidates, size, criterion=criterion, axis=b[0])
+        if size < 2:
+            assert chosen.status == "unobservable"
+            continue
+        assert chosen.status == "ok" and chosen.proven and len(chosen.chosen) == size
+        assert chosen.value == pytest.approx(brute_force(candidates, size, criterion, b[0]), rel=1e-8)
+
+
 def test_bounds_hold_without_branching_and_are_tight() -> None:
     """40 fields of 20 degrees half-angle, about 50 candidates: the first bound against the proven optimum."""
     sky = generated_sky()

@@ -396,51 +396,60 @@ def _relaxation(problem: _Problem, target: float) -> tuple[float, np.ndarray, np
     # Strictly feasible start: an even share of each camera's room.
     share = room * (problem.count / room.sum()) / np.maximum(sizes, 1)
     x = share[camera]
-    best_bound, best_choice, best_scores = -np.inf, np.zeros(0, dtype=int), np.zeros(len(forced))
+    # Taking every candidate is a bound too, poor but always there: the criterion falls with every star.
+    everything = float(problem.values(problem.information.sum(axis=0)))
+    best_bound = everything if np.isfinite(everything) else 0.0
+    best_choice, best_scores = np.zeros(0, dtype=int), np.zeros(len(forced))
     best_x = np.ones(len(forced))
     weight = _matrix(problem.weight)
     low = high = cap = np.zeros(0)  # multipliers of x >= 0, x <= 1 and of the quotas
-    for iteration in range(40):
-        inverse = np.linalg.inv(_matrix(base + x @ m))
-        middle = inverse @ weight @ inverse
-        gradient6 = _entries(middle) * _DOUBLED
-        value = float(np.sum(inverse * weight))
-        scores = problem.information @ gradient6
-        chosen = problem.best(scores)
-        bound = 2 * value - float(gradient6 @ problem.base) - float(scores[chosen].sum())
-        if bound > best_bound:
-            best_bound, best_choice, best_scores = bound, chosen, scores
-            best_x[~forced] = x
-        # No bound can rise above the value: stop when the rest cannot matter against what is missing to the target.
-        if best_bound >= target * (1 - _SAME) or value - best_bound <= max(0.02 * (target - best_bound), 1e-9 * value):
-            break
-        slack = caps - capped @ x
-        if iteration == 0:
-            barrier = (value - bound) / (2 * n)
-            low, high, cap = barrier / x, barrier / (1 - x), barrier / slack
-        barrier = 0.15 * float(low @ x + high @ (1 - x) + cap @ slack) / (2 * n + len(caps))
-        # Primal-dual Newton step: the matrix is diagonal plus rank six (plus one for each quota).
-        gradient = -scores[~forced] - barrier / x + barrier / (1 - x) + capped.T @ (barrier / slack)
-        diagonal = low / x + high / (1 - x)
-        curvature = _curvature(inverse, middle)
-        root = np.linalg.cholesky(curvature + 1e-13 * np.trace(curvature) * np.eye(6))
-        low_rank = np.hstack((m @ root, capped.T * np.sqrt(cap / slack)))
-        scaled = low_rank / diagonal[:, None]
-        inner = np.eye(low_rank.shape[1]) + low_rank.T @ scaled
-        solved = np.column_stack((-gradient, equal.T)) / diagonal[:, None]
-        solved -= scaled @ np.linalg.solve(inner, low_rank.T @ solved)
-        multiplier = np.linalg.solve(equal @ solved[:, 1:], equal @ solved[:, 0])
-        step = solved[:, 0] - solved[:, 1:] @ multiplier
-        step_low = barrier / x - low - low / x * step
-        step_high = barrier / (1 - x) - high + high / (1 - x) * step
-        pace = capped @ step
-        step_cap = barrier / slack - cap + cap / slack * pace
-        primal = min(_longest(x, step), _longest(1 - x, -step), _longest(slack, -pace))
-        dual = min(_longest(low, step_low), _longest(high, step_high), _longest(cap, step_cap))
-        x = x + primal * step
-        low, high, cap = low + dual * step_low, high + dual * step_high, cap + dual * step_cap
-        if float(min(x.min(), 1 - x.max())) < 1e-14:
-            break
+    try:
+        with np.errstate(all="ignore"):
+            for iteration in range(40):
+                inverse = np.linalg.inv(_matrix(base + x @ m))
+                middle = inverse @ weight @ inverse
+                gradient6 = _entries(middle) * _DOUBLED
+                value = float(np.sum(inverse * weight))
+                scores = problem.information @ gradient6
+                chosen = problem.best(scores)
+                bound = 2 * value - float(gradient6 @ problem.base) - float(scores[chosen].sum())
+                if np.isfinite(bound) and bound > best_bound:
+                    best_bound, best_choice, best_scores = bound, chosen, scores
+                    best_x[~forced] = x
+                # No bound rises above the value: stop when the rest cannot matter to what is missing to the target.
+                if best_bound >= target * (1 - _SAME) or value - best_bound <= max(
+                    0.02 * (target - best_bound), 1e-9 * value
+                ):
+                    break
+                slack = caps - capped @ x
+                if iteration == 0:
+                    barrier = (value - bound) / (2 * n)
+                    low, high, cap = barrier / x, barrier / (1 - x), barrier / slack
+                barrier = 0.15 * float(low @ x + high @ (1 - x) + cap @ slack) / (2 * n + len(caps))
+                # Primal-dual Newton step: the matrix is diagonal plus rank six (plus one for each quota).
+                gradient = -scores[~forced] - barrier / x + barrier / (1 - x) + capped.T @ (barrier / slack)
+                diagonal = low / x + high / (1 - x)
+                curvature = _curvature(inverse, middle)
+                root = np.linalg.cholesky(curvature + 1e-13 * np.trace(curvature) * np.eye(6))
+                low_rank = np.hstack((m @ root, capped.T * np.sqrt(cap / slack)))
+                scaled = low_rank / diagonal[:, None]
+                inner = np.eye(low_rank.shape[1]) + low_rank.T @ scaled
+                solved = np.column_stack((-gradient, equal.T)) / diagonal[:, None]
+                solved -= scaled @ np.linalg.solve(inner, low_rank.T @ solved)
+                multiplier = np.linalg.solve(equal @ solved[:, 1:], equal @ solved[:, 0])
+                step = solved[:, 0] - solved[:, 1:] @ multiplier
+                step_low = barrier / x - low - low / x * step
+                step_high = barrier / (1 - x) - high + high / (1 - x) * step
+                pace = capped @ step
+                step_cap = barrier / slack - cap + cap / slack * pace
+                primal = min(_longest(x, step), _longest(1 - x, -step), _longest(slack, -pace))
+                dual = min(_longest(low, step_low), _longest(high, step_high), _longest(cap, step_cap))
+                x = x + primal * step
+                low, high, cap = low + dual * step_low, high + dual * step_high, cap + dual * step_cap
+                if float(min(x.min(), 1 - x.max())) < 1e-14:
+                    break
+    except np.linalg.LinAlgError:
+        pass  # rounding has the last word: every bound met so far holds
     return best_bound, best_choice, best_scores, best_x
 
 
@@ -615,7 +624,7 @@ def _search(problem: _Problem, answer: Any, exact: bool, node_limit: int) -> Sel
             first, upper = second, other
     incumbent = first
     if not exact:
-        gap = max(upper / bound - 1, 0.0)
+        gap = max(upper / bound - 1, 0.0) if bound > 0 else np.inf
         return answer(
             "ok",
             f"greedy and exchange among {n} visible stars; at most {100 * gap:.3g} % above the optimum",
@@ -679,7 +688,7 @@ def _search(problem: _Problem, answer: Any, exact: bool, node_limit: int) -> Sel
             pending = False
     lower = min(heap[0][0], upper) if heap else upper
     proven = lower >= upper * (1 - _SAME)
-    gap = 0.0 if proven else upper / lower - 1
+    gap = 0.0 if proven else upper / lower - 1 if lower > 0 else np.inf
     why = (
         f"proven best among {n} visible stars"
         if proven
