@@ -369,7 +369,7 @@ class Surveyor:
         plans: list[AreaPlan] = []
         left: Outline | None = None
         refusal: InfeasibleError | None = None
-        tried = refused = 0
+        tried = refused = hopeless = 0
         for pass_ in self.passes(*area.center, reach):
             try:
                 azimuth = check_azimuth(area, pass_)
@@ -377,7 +377,7 @@ class Surveyor:
                 if refusal is None or (error.excess or 0.0) < (refusal.excess or math.inf):
                     refusal = error
                 refused += 1
-                if refused > 8 and not tried:
+                if refused >= 4 and not tried:
                     break
                 continue
             if plane is None:
@@ -398,6 +398,10 @@ class Surveyor:
                 refusal = error_ if refusal is None or not plans else refusal
                 if not plans:
                     plane = None if area.azimuth is None else plane
+                    # Another pass changes the angle off the nadir, and hardly the rates.
+                    hopeless += error_.limit != "off-nadir angle"
+                    if hopeless >= 3:
+                        break
                 continue
             plans.append(plan)
             if shared:
@@ -407,7 +411,7 @@ class Surveyor:
             if plan.complete:
                 return plane, plans
             left = plan.outlines[-1]
-            if sum(len(p.scans) for p in plans) > 400:
+            if len(plans) >= 3 and self._out_of_reach(area, plans):
                 break
         if not tried and refusal is None:
             raise self.never_visible(area.name, *area.center, where=f"[[area]] {area.name}")
@@ -415,11 +419,18 @@ class Surveyor:
             edge = float(np.min(plans[-1].outlines[-1].upper[:, 1]))
             missing = area.width / 2 - edge
             raise InfeasibleError(
-                f"the area {area.name} is larger than any plan: {sum(len(p.scans) for p in plans)} scans in {len(plans)} "
-                f"passes of {HORIZON / 86400:.0f} days leave {missing / 1e3:.0f} km of its {area.width / 1e3:.0f} km of "
-                f"width uncovered", limit="width of the area", excess=missing)
+                f"the area {area.name} is larger than any plan of {HORIZON / 86400:.0f} days: "
+                f"{sum(len(p.scans) for p in plans)} scans in the {len(plans)} passes of the first "
+                f"{plans[-1].stop / 86400:.1f} days leave {missing / 1e3:.0f} km of its {area.width / 1e3:.0f} km of width "
+                f"uncovered", limit="width of the area", excess=missing)
         assert refusal is not None
         raise refusal
+
+    def _out_of_reach(self, area: AreaRequest, plans: list[AreaPlan]) -> bool:
+        """Whether the progress so far would leave more than half of the rest uncovered at the end of the horizon."""
+        edge = float(np.min(plans[-1].outlines[-1].upper[:, 1]))
+        progress = (edge + area.width / 2) / max(plans[-1].stop - plans[0].start, 1.0)
+        return progress * (HORIZON - plans[-1].stop) < 0.5 * (area.width / 2 - edge)
 
     def _plan_pass(self, planner: PassPlanner, area: AreaRequest, done: int, after: float | None,
                    ) -> tuple[AreaPlan | None, InfeasibleError]:
@@ -484,7 +495,6 @@ class Surveyor:
                 raise failure
             if plan is not None and plan.complete:
                 return plan, failure
-        reason = failure
         start = min(count - 1, most)
         for fewer_count in range(max(1, start), 0, -1):
             if fewer_count >= count and area.scans is None and count <= most + 2:
@@ -492,7 +502,7 @@ class Surveyor:
             plan = attempt(fewer_count, False)
             if plan is not None and plan.feasible:
                 return replace(plan, complete=False), failure
-        return None, reason
+        return None, failure
 
     def _most_scans(self, area: AreaRequest, planner: PassPlanner) -> int:
         """Rough number of scans that fit into the time in which the area is in the cone."""

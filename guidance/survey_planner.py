@@ -310,7 +310,7 @@ class PassPlanner:
         alternating = [tuple((i % 2 == 0) == first for i in range(count)) for first in (True, False)]
         directions = list(dict.fromkeys([*alternating, (True,) * count]))
         sides = (True, False) if count > 1 else (True,)
-        return [Pattern(side, d) for d, side in itertools.product(directions, sides)]
+        return [Pattern(side, d) for side, d in itertools.product(sides, directions)]
 
     def best(self, count: int, *, fill: bool, shift: float = 0.0) -> AreaPlan:
         """The quickest feasible plan with a number of scans; the least infeasible one where none is feasible.
@@ -324,8 +324,9 @@ class PassPlanner:
         failure: BoresightError | None = None
         for pattern in self.patterns(count):
             strips = [replace(s) for s in rough[0].strips] if rough else self.guess(count, fill)
-            if len(rough) == 2 and min(p.off_nadir for p in rough) > self.limits.off_nadir + math.radians(6.0):
-                break  # far too many scans: the other patterns will not help
+            if not pattern.from_left and rough and (
+                    min(p.off_nadir for p in rough) > self.limits.off_nadir + math.radians(6.0)):
+                break  # far too many scans: the other side will not help
             try:
                 rough.append(self.simulate(pattern, strips, fill=fill, shift=shift, rounds=3 if rough else 20))
             except (InfeasibleError, GeometryError) as error:
