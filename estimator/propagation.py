@@ -111,7 +111,8 @@ class Flow:
         self.columns = column + int(sum(u.manifold.tangent for u in shared))
         right_side = self._right_side(f"{name}_right_side", inputs, held, derivative)
         self.step = compiled(self._step(f"{name}_sensitivity", right_side, inputs, held, substeps, True))
-        self.plain = self._step(name, right_side, inputs, held, substeps, False)  # to be differentiated: not compiled
+        # For solvers that differentiate by themselves: not machine code, and one list of scalar operations.
+        self.plain = self._step(name, right_side, inputs, held, substeps, False).expand()
         self._accumulated: dict[int, ca.Function] = {}
 
     def _right_side(self, name: str, inputs: int, held: int, derivative: Callable[..., ca.SX]) -> ca.Function:
