@@ -72,8 +72,8 @@ class Slew:
             "status": self.status, "why": self.why,
             "duration_s": o.duration if o else None,
             "lower_bound_s": self.lower_bound,
-            "closed_form": {name: {"duration_s": law.duration if law else None}
-                            for name, law in self.closed_forms.items()},
+            "closed_form": {name: {"duration_s": law.duration} for name, law in self.closed_forms.items()
+                            if law is not None},
             "largest": {"rate": v.rate, "acceleration": v.acceleration, "jerk": v.jerk} if v else None,
             "terminal_error_rad": v.terminal_error if v else None,
             "seconds": o.seconds if o else None,
@@ -134,8 +134,8 @@ def solve_slew(request: SlewRequest, *, near: Slew | Optimum | None = None, comp
         if request.objective == "smoothness" and request.duration is not None and request.duration < bound:
             ratio = bound / request.duration
             raise InfeasibleError(
-                f"the duration {request.duration:.6g} s is below the least possible {bound:.6g} s; it would need a rate "
-                f"limit of up to {ratio:.4g}, an acceleration limit of up to {ratio**2:.4g} and a jerk limit of up to "
+                f"the duration {request.duration:.6g} s is below the least possible {bound:.6g} s; it would need a "
+                f"rate limit up to {ratio:.4g}, an acceleration limit up to {ratio**2:.4g} and a jerk limit up to "
                 f"{ratio**3:.4g} times the present one", limit="duration", excess=bound - request.duration)
         optimum = optimal_slew(request, near=start)
     except InfeasibleError as error:

@@ -10,7 +10,6 @@ import time
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from estimator.models.errors import InfeasibleError
@@ -28,18 +27,24 @@ from guidance.kinematics import (
 from guidance.rodrigues_slew import rodrigues_slew
 from guidance.slew_bounds import lower_bound
 from guidance.slew_envelope import Envelope, envelope_of
-from guidance.slew_problem import FIXED_SHARED, ROW_NAMES, STAGE, STATE, transcription
+from guidance.slew_problem import ROW_NAMES, STAGE, STATE, Extras, transcription
 from guidance.slew_request import Limits, SlewRequest
-from guidance.slew_start import eigenaxis_profile, interpolated, starting_motion, switching_mesh
+from guidance.slew_start import PARTS, eigenaxis_profile, interpolated, starting_motion, switching_mesh
 
 Array = np.ndarray
 
 _MARGIN = 2e-7  # relative: the limits inside the solver, so that its tolerance does not break them outside
 _PERMITTED = 1e-6  # relative: the most that a certified slew may exceed a limit
-_NEAR_PROFILE, _NEARER = 0.006, 0.002  # relative: an optimum this near the eigenaxis profile has its switches
-# (the second number where the ends accelerate)
-_FINE, _REFINEMENTS, _SETTLED = 40, 3, 1.5e-4  # intervals of the refined mesh, most refinements, relative gain to stop at
+_NEAR_PROFILE = 0.006  # relative: an optimum this near the eigenaxis profile has its switches,
+_NEARER = 0.002  # and this near where the ends accelerate
+_FINE = 40  # intervals of a refined mesh
+_REFINEMENTS = 3  # at most
+_SETTLED = 1.5e-4  # relative gain of a refinement below which there is no other
 _LAST_PIECE = 1e-3  # of the time to build up the acceleration: length of the piece with the jerk asked for at the stop
+
+
+_QUICK: dict[str, Any] = {"ipopt.mu_init": 1e-3}  # options for a start near the answer
+_BUILDING = [0.0]  # s, all the time this process has spent on making and compiling solvers
 
 
 @dataclass(frozen=True)
@@ -59,7 +64,7 @@ class Optimum:
     Attributes:
         profile: the slew, as its jerk.
         long_way: whether it goes the longer way round.
-        seconds: time that the solver and its preparation took, s.
+        seconds: time from request to answer, s, without that of making and compiling solvers, done once.
         iterations: of the solver, all solves together.
         solver: which one gave the answer.
         steps: what was tried, in words.
@@ -127,10 +132,13 @@ def _reference(request: SlewRequest, long_way: bool) -> tuple[Array, Array]:
 def _solve(request: SlewRequest, limits: Limits, envelope: Envelope, long_way: bool, fractions: Array, sigma: Array,
            rate: Array, acceleration: Array, duration: float, *, name: str = "ipopt", scales: Scales | None = None,
            margin: Array | float = 0.0, dual: tuple[Array, Array] | None = None, x0: Array | None = None,
-           **options: Any) -> _Attempt:
+           options: dict[str, Any] | None = None) -> _Attempt:
     """One call of the solver from the motion at the nodes of a mesh, or from the unknowns ``x0`` of another call."""
     count = len(fractions)
+    begun = time.perf_counter()
     problem = transcription(count, envelope.extras)
+    solver = problem.solver(name, **(options or {}))
+    _BUILDING[0] += time.perf_counter() - begun
     reference, stop = _reference(request, long_way)
     if scales is None:
         peak = max(float(np.max(norm(rate))), float(np.linalg.norm(stop)) / duration, 1e-9)
@@ -161,7 +169,6 @@ def _solve(request: SlewRequest, limits: Limits, envelope: Envelope, long_way: b
                             "p": np.concatenate([shared, own])}
     if dual is not None:
         call |= {"lam_g0": dual[0], "lam_x0": dual[1]}
-    solver = problem.solver(name, **options)
     answer = solver(**call)
     stats = solver.stats()
     x = answer["x"].full().ravel()
@@ -271,43 +278,43 @@ def _one_way(request: SlewRequest, limits: Limits, envelope: Envelope, long_way:
     still = not (np.any(request.start.acceleration) or np.any(request.stop.acceleration))
     spent, best = 0, None
 
-    def attempt(what: str, *args: Any, **options: Any) -> _Attempt:
+    def attempt(what: str, *args: Any, options: dict[str, Any] | None = None) -> _Attempt:
         nonlocal spent, best
-        result = _solve(request, limits, envelope, long_way, *args, **options)
-        if not result.success and name != "ipopt" and options.get("name") == name:
+        result = _solve(request, limits, envelope, long_way, *args, name=name, options=options)
+        if not result.success and name != "ipopt":
             spent += result.iterations
             steps.append(f"{label}, {what}: {name} did not converge, falling back to ipopt")
-            result = _solve(request, limits, envelope, long_way, *args, **(options | {"name": "ipopt"}))
+            result = _solve(request, limits, envelope, long_way, *args)
         spent += result.iterations
         steps.append(f"{label}, {what}: {result.status or result.success}, {result.iterations} iterations")
-        if best is None or (result.success, -result.duration) > (best.success, -best.duration):
+        smooth = request.objective == "smoothness"  # of equal durations the later answer is on the finer mesh
+        if (best is None or result.success > best.success
+                or (result.success == best.success and (smooth or result.duration < best.duration))):
             best = result
         return result
 
-    options: dict[str, Any] = {"name": name}
-    if name == "ipopt":
-        options["ipopt.mu_init"] = 1e-3
+    quick = _QUICK if name == "ipopt" else {}
     if speed.fits and speed.duration > 0:
         mesh = switching_mesh(speed, limits, exact=alone)
-        first = attempt("from the eigenaxis profile", mesh, *starting_motion(request, axis, speed, mesh), **options)
+        first = attempt("from the eigenaxis profile", mesh, *starting_motion(request, axis, speed, mesh), options=quick)
         if plain and first.success and abs(first.duration / speed.duration - 1) < (_NEAR_PROFILE if still else _NEARER):
             return first, spent
     if best is None or not best.success or not plain:
         bound = max(lower_bound(request, limits, long_way=long_way), 1e-3)
         start = _uniform_start(request, limits, long_way, bound, 32)
         if start is not None:
-            attempt("from the polynomial", *start, name=name)
+            attempt("from the polynomial", *start)
         if best is None or not best.success:
             duration = 2 * max(bound, speed.duration, 1e-3)
             mesh = np.full(32, 1 / 32)
             sigma, rate, acceleration, _ = starting_motion(request, axis, replace(
                 speed, durations=np.maximum(speed.durations, duration / 7)), mesh)
-            attempt("from a slower start", mesh, sigma, rate, acceleration, duration, name=name)
+            attempt("from a slower start", mesh, sigma, rate, acceleration, duration)
     if best is not None and best.success:
         for _ in range(_REFINEMENTS):
             before = best.duration
             fractions, sigma, rate, acceleration = _refined(best, limits, _FINE)
-            attempt("on a refined mesh", fractions, sigma, rate, acceleration, best.duration, **options)
+            attempt("on a refined mesh", fractions, sigma, rate, acceleration, best.duration, options=quick)
             if best.duration > before * (1 - _SETTLED):
                 break
     return best, spent
@@ -323,7 +330,7 @@ def optimal_slew(request: SlewRequest, *, near: Optimum | None = None) -> Optimu
     Raises:
         InfeasibleError: no slew keeps the limits; says which limit and by how much.
     """
-    began = time.perf_counter()
+    began = time.perf_counter() - _BUILDING[0]
     limits, envelope = envelope_of(request)
     envelope.check_ends(request)
     inner, last = _effective_stop(request, limits)
@@ -333,7 +340,8 @@ def optimal_slew(request: SlewRequest, *, near: Optimum | None = None) -> Optimu
         again = _replanned(inner, limits, envelope, near, name)
         if again is not None:
             profile = _with_last(again[0], last)
-            return Optimum(profile, near.long_way, time.perf_counter() - began, again[1].iterations, again[1].solver,
+            seconds = time.perf_counter() - _BUILDING[0] - began
+            return Optimum(profile, near.long_way, seconds, again[1].iterations, again[1].solver,
                            ("from the neighbouring answer",), again[2])
         steps.append("the neighbouring answer did not help")
     best: _Attempt | None = None
@@ -363,11 +371,11 @@ def optimal_slew(request: SlewRequest, *, near: Optimum | None = None) -> Optimu
     worst = max(excess, key=lambda k: excess[k])
     error = float(angle_between(profile.final()[0], inner.stop.quaternion))
     if excess[worst] > _PERMITTED or error > 4e-8:
-        raise InfeasibleError(f"the solver's answer exceeds the {worst} limit by {excess[worst]:.2e} of it and misses the "
-                              f"attitude by {error:.2e} rad: no slew was certified", limit=worst,
+        raise InfeasibleError(f"the solver's answer exceeds the {worst} limit by {excess[worst]:.2e} of it and misses "
+                              f"the attitude by {error:.2e} rad: no slew was certified", limit=worst,
                               excess=excess[worst])
-    return Optimum(_with_last(profile, last), best_way, time.perf_counter() - began, total, best.solver, tuple(steps),
-                   {"attempt": best})
+    seconds = time.perf_counter() - _BUILDING[0] - began
+    return Optimum(_with_last(profile, last), best_way, seconds, total, best.solver, tuple(steps), {"attempt": best})
 
 
 def _with_last(profile: JerkProfile, last: JerkProfile | None) -> JerkProfile:
@@ -386,7 +394,7 @@ def _replanned(request: SlewRequest, limits: Limits, envelope: Envelope, near: O
     empty = np.zeros((1, 3))
     result = _solve(request, limits, envelope, near.long_way, old.fractions, empty, empty, empty, old.duration,
                     scales=old.scales, x0=old.x.copy(), dual=(old.lam_g, old.lam_x),
-                    **{"ipopt.warm_start_init_point": "yes", "ipopt.mu_init": 1e-6,
+                    options={"ipopt.warm_start_init_point": "yes", "ipopt.mu_init": 1e-6,
                        "ipopt.warm_start_bound_push": 1e-8, "ipopt.warm_start_slack_bound_push": 1e-8,
                        "ipopt.warm_start_mult_bound_push": 1e-8, "ipopt.max_iter": 40})
     if not result.success:
@@ -410,7 +418,7 @@ def _tightened(request: SlewRequest, limits: Limits, envelope: Envelope, long_wa
             return profile, attempt, spent
         margin = margin + np.where(worst > 1e-7, 1.2 * worst + 1e-7, 0.0)
         again = _solve(request, limits, envelope, long_way, attempt.fractions, empty, empty, empty, attempt.duration,
-                       scales=attempt.scales, x0=attempt.x.copy(), margin=margin, **{"ipopt.mu_init": 1e-3})
+                       scales=attempt.scales, x0=attempt.x.copy(), margin=margin, options=_QUICK)
         spent += again.iterations
         steps.append(f"margin {float(np.max(margin)):.1e} between nodes: {again.status}, {again.iterations} iterations")
         if not again.success:
@@ -438,8 +446,13 @@ def _explain_failure(request: SlewRequest, limits: Limits, failures: list[_Attem
         raise InfeasibleError("no starting point was found", limit="", excess=None)
     worst = min(failures, key=lambda a: a.worst[1])
     name, excess = worst.worst
-    raise InfeasibleError(f"no slew was found ({worst.status}): nearest to one, the {name} still misses by {excess:.3e} of "
-                          "its scale", limit=name, excess=excess)
+    raise InfeasibleError(f"no slew was found ({worst.status}): nearest to one, the {name} still misses by "
+                          f"{excess:.3e} of its scale", limit=name, excess=excess)
 
 
-__all__ = ["FIXED_SHARED", "Optimum", "ca", "certificate", "optimal_slew"]
+def prepare() -> None:
+    """Make and compile what the usual slew needs, so that the first answer is as quick as the later ones."""
+    begun = time.perf_counter()
+    transcription(2 * (PARTS[0] + PARTS[1] + PARTS[2]) + PARTS[3], Extras()).solver("ipopt", **_QUICK)
+    transcription(_FINE, Extras()).solver("ipopt", **_QUICK)
+    _BUILDING[0] += time.perf_counter() - begun

@@ -7,8 +7,8 @@ sixth-order Magnus expansion. With constant jerk
 
 - the acceleration is linear in the interval and its norm is largest at a node,
 - the rate is quadratic and lies in the hull of its Bezier control points: with b = w_k + h eps_k / 2 the two inner
-  points of the halved interval, (w_k + b) / 2 = w_k + h eps_k / 4 and (b + w_(k+1)) / 2 = w_k + 3/4 h eps_k + h^2 u / 4,
-  are kept in the ball, and since the acceleration is continuous the nodes lie between two such points.
+  points of the halved interval, (w_k + b) / 2 = w_k + h eps_k / 4 and (b + w_(k+1)) / 2 = w_k + 3 h eps_k / 4
+  + h^2 u / 4, are kept in the ball, and since the acceleration is continuous the nodes lie between two such points.
 
 Keep-out cones and the envelopes of torque and momentum are kept at the nodes with a margin that the caller enlarges
 until a dense check between the nodes is content (:mod:`guidance.slew`).
@@ -193,8 +193,8 @@ def stage_kernel(extras: Extras) -> Kernel:
         return np.array(rows, dtype=int), np.array(columns, dtype=int)
 
     return Kernel(function("rows", [], [cost, g]),
-                  function("jacobian", [], [g, ca.vertcat(*jacobian.nonzeros())]),
-                  function("hessian", [lam, weight], [ca.vertcat(*hessian.nonzeros())]),
+                  function("jacobian", [], [g, jacobian.nz[:]]),
+                  function("hessian", [lam, weight], [hessian.nz[:]]),
                   function("gradient", [], [cost, ca.gradient(cost, x)]),
                   index(jacobian), index(hessian), int(g.shape[0]))
 

@@ -1,6 +1,6 @@
 """What a slew is asked to do: limits, attitude and motion at both ends, and what must be kept away from.
 
-The request file is TOML; every quantity is in SI and radians, quaternions are ``(w, x, y, z)``, ``inertial_from_body``::
+The request file is TOML; every quantity is in SI and radians, quaternions ``(w, x, y, z)`` are ``inertial_from_body``::
 
     [limits]
     rate = 0.0436            # rad/s
@@ -18,8 +18,8 @@ The request file is TOML; every quantity is in SI and radians, quaternions are `
 
 Optional tables: ``[[keep_out]]`` (``name``, ``axis`` in the body, ``direction`` in the inertial frame, ``angle``),
 ``[actuators]`` (``inertia``, ``torque``, ``momentum`` or ``gyro_momentum``, ``total_momentum``), ``[objective]``
-(``kind = "time" | "smoothness"``, ``duration``), ``[solver]`` (``name = "ipopt" | "fatrop"``) and ``[export]`` (``epoch``,
-``time_system``, ``reference_frame``, ``object_name``, ``object_id``, ``step``).
+(``kind = "time" | "smoothness"``, ``duration``), ``[solver]`` (``name = "ipopt" | "fatrop"``) and ``[export]``
+(``epoch``, ``time_system``, ``reference_frame``, ``object_name``, ``object_id``, ``step``).
 """
 
 from __future__ import annotations

@@ -73,7 +73,8 @@ def speed_profile(angle: float, start_speed: float, stop_speed: float, limits: L
         """Lowest peak: slope brought to zero, upwards where it is positive."""
         return speed + slope * abs(slope) / (2 * j)
 
-    low, high, coast, fits = max(least(start_speed, start_slope), least(stop_speed, -stop_slope)), limits.rate, 0.0, True
+    low, high = max(least(start_speed, start_slope), least(stop_speed, -stop_slope)), limits.rate
+    coast, fits = 0.0, True
     if low >= high or ramps(low)[2] >= angle:
         peak, fits = low, False
     elif ramps(high)[2] <= angle:
