@@ -23,13 +23,15 @@ import numpy as np
 from estimator.linear_block import LinearBlock
 from estimator.residuals import Kernel, Linearization
 from estimator.signals import LinearSignal, Values
+from estimator.stretched_block import StretchedBlock
 from estimator.unknowns import Unknown, Vector
 
 NEGLIGIBLE = 1e-7
 """Sensitivity, relative to the largest, below which a direction of the block is not felt by the other residuals."""
 
 
-def felt_directions(block: LinearBlock, epochs: Sequence[tuple[np.ndarray, int]]) -> tuple[np.ndarray, ...]:
+def felt_directions(block: LinearBlock | StretchedBlock,
+                    epochs: Sequence[tuple[np.ndarray, int]]) -> tuple[np.ndarray, ...]:
     """Per axis, the orthonormal directions (rank, felt) of zeta that values at ``epochs`` depend on.
 
     Args:
@@ -49,7 +51,7 @@ def felt_directions(block: LinearBlock, epochs: Sequence[tuple[np.ndarray, int]]
             continue
         rows = np.concatenate(stacked)
         if len(rows) > rows.shape[1]:
-            rows = np.linalg.qr(rows, mode="r")
+            rows = np.asarray(np.linalg.qr(rows, mode="r"))
         _, singular, vectors = np.linalg.svd(rows, full_matrices=False)
         result.append(vectors[singular > NEGLIGIBLE * singular[0]].T)
     return tuple(result)
@@ -76,7 +78,7 @@ class TrajectoryResidual:
     channel: str
     unit: str
     trajectory: Unknown
-    block: LinearBlock
+    block: LinearBlock | StretchedBlock
     directions: tuple[np.ndarray, ...]
     time: np.ndarray
     values: np.ndarray

@@ -10,13 +10,14 @@ the star tracker along every rotation arc. What a campaign cannot determine is l
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
 from estimator.effects.declaration import ENVIRONMENT, EffectInstance, Layout
-from estimator.linear_block import choose_degree, compress
+from estimator.linear_block import LinearBlock, choose_degree, compress
 from estimator.losses import Loss, Quadratic
 from estimator.models.errors import RequestError, TooFewDataError
 from estimator.models.fourier_trajectory import FourierFrame
@@ -24,6 +25,15 @@ from estimator.models.inertia import entries_of
 from estimator.problem import Problem
 from estimator.propagation import PropagatedSignal
 from estimator.residuals import KernelResidual, Residual
+from estimator.stretched_block import (
+    FEWEST_SAMPLES,
+    StretchedBlock,
+    StretchedFrame,
+    choose_degrees,
+    compress_stretches,
+    stretched_frame,
+    stretches_of,
+)
 from estimator.trajectory_residual import TrajectoryResidual, felt_directions, trajectory_unknown
 from estimator.unknowns import UnitQuaternion, Unknown, Vector
 from problems.alignment.attitude_at_epochs import AttitudeAtEpochs, attitude_at_epochs
@@ -35,7 +45,6 @@ from problems.alignment.kernels import (
     attitude_kernel,
     doppler_kernel,
     effect_unknown,
-    inertia_trace_unknown,
     position_effect_kernel,
     rotation_flow,
 )
@@ -44,6 +53,9 @@ from problems.alignment.starting_point import StartingPoint, starting_point
 LONGEST_STEP = 0.5  # s between nodes of a rotation arc
 ROTATION_PER_STEP = 0.02  # rad between nodes: the fourth-order step is then exact to 1e-11 rad over an arc
 HELD_OUT_BLOCK = 10  # consecutive positions that are held out together
+FEWEST_HELD_OUT_BLOCKS = 10  # in a stretch among several from which positions are held out
+EARTH_GRAVITY = 3.986004418e14  # m3/s2
+EDGE = 1e-6  # s outside of the positions' data that still counts as inside: rounding of times
 FEWEST_ARC_SAMPLES = 4  # star tracker samples that make a rotation arc worth its six unknowns
 
 
@@ -57,20 +69,46 @@ class AlignmentModel:
         degree: degree of the Fourier trajectory; None chooses it from the data.
         hold_out: fraction of every arc, its end, that is kept from the fit for proofs; of the positions, as many
             short blocks.
+        given_frame: frame of the trajectory to use as it is, chosen on the same positions; None for a new one.
+        dropped_positions: number of positions in stretches too short for a trajectory of their own.
     """
 
     campaign: Campaign
     loss: Loss
     degree: int | None = None
     hold_out: float = 0.0
+    given_frame: FourierFrame | StretchedFrame | None = None
+    dropped_positions: int = 0
 
     @cached_property
-    def frame(self) -> FourierFrame:
-        """The Fourier frame of the trajectory."""
+    def stretches(self) -> tuple[slice, ...]:
+        """The stretches of positions, far apart, that have a trajectory each."""
+        return stretches_of(self.campaign.gnss.time, orbital_period(self.campaign))
+
+    @cached_property
+    def coverage(self) -> StretchedFrame:
+        """First and last time of the positions in each stretch (the frame itself may be longer than its data)."""
+        return stretched_frame(self.campaign.gnss.time, self.stretches, 0)
+
+    @cached_property
+    def frame(self) -> FourierFrame | StretchedFrame:
+        """The Fourier frame of the trajectory, or those of its stretches."""
         gnss = self.campaign.gnss
+        if self.given_frame is not None:
+            return self.given_frame
+        if len(self.stretches) > 1:
+            if self.degree is not None:
+                return stretched_frame(gnss.time, self.stretches, self.degree)
+            return choose_degrees(gnss.time, gnss.position, gnss.standard_deviation, self.stretches)[0]
         if self.degree is not None:
             return FourierFrame(float(gnss.time[0]), float(gnss.time[-1]), self.degree)
         return choose_degree(gnss.time, gnss.position, gnss.standard_deviation).frame
+
+    def _compressed(self, weights: np.ndarray) -> LinearBlock | StretchedBlock:
+        gnss = self.campaign.gnss
+        if isinstance(self.frame, StretchedFrame):
+            return compress_stretches(self.frame, gnss.time, gnss.position, weights)
+        return compress(self.frame, gnss.time, gnss.position, weights)
 
     @cached_property
     def position_weights(self) -> np.ndarray:
@@ -82,7 +120,7 @@ class AlignmentModel:
             return weights
         robust = np.ones(len(gnss.time))
         for _ in range(12):
-            block = compress(self.frame, gnss.time, gnss.position, weights * robust[:, None])
+            block = self._compressed(weights * robust[:, None])
             renewed = self.loss.weight(np.sum(block.residuals() ** 2 * weights, axis=1))
             change = float(np.max(np.abs(renewed - robust)))
             robust = renewed
@@ -92,13 +130,22 @@ class AlignmentModel:
 
     @cached_property
     def used_positions(self) -> np.ndarray:
-        """Mask (n,) of the positions in the fit: all but one block in so many where data are held out."""
+        """Mask (n,) of the positions in the fit: all but one block in so many where data are held out.
+
+        A stretch with few blocks, whose trajectory would suffer from the loss of one, keeps all of its positions.
+        """
         time = self.campaign.gnss.time
+        used = np.ones(len(time), dtype=bool)
         if self.hold_out <= 0:
-            return np.ones(len(time), dtype=bool)
-        step = float(np.median(np.diff(time)))
-        block = np.floor((time - time[0]) / (HELD_OUT_BLOCK * step) + 1e-9).astype(int)
-        return np.floor((block + 1) * self.hold_out) == np.floor(block * self.hold_out)
+            return used
+        for s in self.stretches:
+            if s.stop - s.start < FEWEST_HELD_OUT_BLOCKS * HELD_OUT_BLOCK and len(self.stretches) > 1:
+                continue
+            part = time[s]
+            step = float(np.median(np.diff(part)))
+            block = np.floor((part - part[0]) / (HELD_OUT_BLOCK * step) + 1e-9).astype(int)
+            used[s] = np.floor((block + 1) * self.hold_out) == np.floor(block * self.hold_out)
+        return used
 
     def used_of_arc(self, time: np.ndarray, start: float, stop: float) -> np.ndarray | None:
         """Mask (n,) of an arc's samples in the fit: all but its end where data are held out, None without."""
@@ -107,25 +154,24 @@ class AlignmentModel:
         return time <= stop - self.hold_out * (stop - start)
 
     @cached_property
-    def block(self):  # type: ignore[no-untyped-def]
-        """The compressed positions (:class:`estimator.linear_block.LinearBlock`)."""
-        gnss = self.campaign.gnss
-        return compress(self.frame, gnss.time, gnss.position, self.position_weights)
+    def block(self) -> LinearBlock | StretchedBlock:
+        """The compressed positions."""
+        return self._compressed(self.position_weights)
 
     def earth_angle(self, time: np.ndarray) -> np.ndarray:
         """Angle of the Earth-fixed frame about +z from inertial (n,), rad."""
         return self.campaign.earth_rotation_angle_at_epoch + self.campaign.earth_rotation_rate * np.asarray(time)
 
     def velocity(self, time: np.ndarray) -> np.ndarray:
-        """Fitted Earth-fixed velocity (n, 3), m/s, at times inside the positions' span (clamped outside)."""
+        """Fitted Earth-fixed velocity (n, 3), m/s; where there are no positions, that of the nearest time with them."""
         return self.block.values(self._inside(time), 1)
 
     def position(self, time: np.ndarray) -> np.ndarray:
-        """Fitted Earth-fixed position (n, 3), m."""
+        """Fitted Earth-fixed position (n, 3), m; outside the positions as :meth:`velocity`."""
         return self.block.values(self._inside(time), 0)
 
     def _inside(self, time: np.ndarray) -> np.ndarray:
-        return np.clip(np.asarray(time, dtype=float), self.frame.start, self.frame.stop)
+        return self.coverage.nearest(time)
 
     @cached_property
     def rotation_arcs(self) -> tuple[tuple[Arc, np.ndarray], ...]:
@@ -133,7 +179,7 @@ class AlignmentModel:
         time = self.campaign.star_tracker.time
         found = []
         for kind in ("free_rotation", "torque_pulse"):
-            for arc in self.campaign.arcs_of_kind(kind):  # type: ignore[arg-type]
+            for arc in self.campaign.arcs_of_kind(kind):
                 index = np.flatnonzero((time >= arc.start - 1e-9) & (time <= arc.stop + 1e-9))
                 if len(index) >= FEWEST_ARC_SAMPLES:
                     found.append((arc, index))
@@ -148,12 +194,35 @@ class AlignmentModel:
     @cached_property
     def doppler_epochs(self) -> np.ndarray:
         """Indices of the Doppler epochs inside both the tracker's and the positions' data."""
-        doppler = self.campaign.doppler
-        if doppler is None:
+        if self.campaign.doppler is None:
             return np.zeros(0, dtype=int)
-        covered = self._attitude_at_doppler.covered
-        inside = (doppler.time >= self.frame.start - 1e-6) & (doppler.time <= self.frame.stop + 1e-6)
-        return np.flatnonzero(covered & inside)
+        return np.flatnonzero(self._attitude_at_doppler.covered & self._inside_positions)
+
+    @cached_property
+    def _inside_positions(self) -> np.ndarray:
+        assert self.campaign.doppler is not None
+        return self.coverage.inside(self.campaign.doppler.time, EDGE)
+
+    @cached_property
+    def left_out(self) -> tuple[str, ...]:
+        """What of the data has no part in the estimate, and why, in sentences."""
+        found = []
+        if self.dropped_positions:
+            found.append(f"{self.dropped_positions} positions left out: stretches of fewer than {FEWEST_SAMPLES} "
+                         "positions, far from all others, determine no trajectory")
+        doppler = self.campaign.doppler
+        if doppler is not None:
+            no_attitude = ~self._attitude_at_doppler.covered
+            count, total = int(no_attitude.sum()), len(doppler.time)
+            if count:
+                found.append(f"{count} of {total} Doppler epochs left out: no star tracker attitude there")
+            outside = ~no_attitude & ~self._inside_positions
+            if outside.any():
+                first = doppler.time[outside][0]
+                found.append(f"{int(outside.sum())} of {total} Doppler epochs left out: outside the "
+                             f"{'stretches' if len(self.stretches) > 1 else 'span'} of the positions (the first at "
+                             f"{first:.3f} s), where the trajectory would be a guess")
+        return tuple(found)
 
     @cached_property
     def _attitude_at_doppler(self) -> AttitudeAtEpochs:
@@ -163,7 +232,15 @@ class AlignmentModel:
     @cached_property
     def start(self) -> StartingPoint:
         """The starting point from the cheap closed forms."""
-        return starting_point(self.campaign, self.velocity, self.position)
+        campaign, doppler = self.campaign, self.campaign.doppler
+        if doppler is not None and not self._inside_positions.all():
+            m = self._inside_positions
+            beams = doppler.beam_direction
+            campaign = replace(campaign, doppler=replace(
+                doppler, time=doppler.time[m], frequency_shift=doppler.frequency_shift[m],
+                standard_deviation=np.broadcast_to(doppler.standard_deviation, doppler.frequency_shift.shape)[m],
+                beam_direction=beams[m] if beams.ndim == 3 else beams))
+        return starting_point(campaign, self.velocity, self.position)
 
     @cached_property
     def session_of_epoch(self) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -184,8 +261,7 @@ class AlignmentModel:
     def layout(self) -> Layout:
         """What effects may need to know about the campaign."""
         campaign = self.campaign
-        radius = float(np.median(np.linalg.norm(campaign.gnss.position, axis=1)))
-        period = 2 * np.pi * np.sqrt(radius**3 / 3.986004418e14)  # s; m3/s2 of the Earth
+        period = orbital_period(campaign)
         doppler = campaign.doppler
         beams = 0 if doppler is None else doppler.frequency_shift.shape[1]
         directions: tuple[tuple[float, float, float], ...] = ()
@@ -243,26 +319,53 @@ class AlignmentModel:
         return tuple(found)
 
 
+def orbital_period(campaign: Campaign) -> float:
+    """Period (s) of a circular orbit at the median distance of the positions from the Earth's centre."""
+    radius = float(np.median(np.linalg.norm(campaign.gnss.position, axis=1)))
+    return float(2 * np.pi * np.sqrt(radius**3 / EARTH_GRAVITY))
+
+
 def alignment_model(campaign: Campaign, *, loss: Loss | None = None, degree: int | None = None,
-                    hold_out: float = 0.0) -> AlignmentModel:
+                    hold_out: float = 0.0, frame: FourierFrame | StretchedFrame | None = None) -> AlignmentModel:
     """Prepare a campaign for the joint problem.
 
     Args:
         campaign: checked flight data.
         loss: robust loss of every sample; default quadratic.
-        degree: degree of the Fourier trajectory; None chooses it from the data.
+        degree: degree of the Fourier trajectory (of each stretch); None chooses it from the data.
         hold_out: fraction of the data that is kept from the fit for proofs.
+        frame: of a model of the same positions, to be used again; ``degree`` then has no say.
 
     Raises:
         RequestError: a fraction outside 0 to 0.9.
-        TooFewDataError: fewer than four positions.
+        TooFewDataError: fewer than four positions, all in all or in every stretch.
     """
-    if len(campaign.gnss.time) < 4:
+    if len(campaign.gnss.time) < FEWEST_SAMPLES:
         raise TooFewDataError("too few positions for a trajectory", where="gnss/position",
-                              value=len(campaign.gnss.time), limit="at least 4")
+                              value=len(campaign.gnss.time), limit=f"at least {FEWEST_SAMPLES}")
     if not 0 <= hold_out <= 0.9:
         raise RequestError("the held-out fraction makes no sense", where="hold_out", value=hold_out, limit="0 to 0.9")
-    return AlignmentModel(campaign, loss or Quadratic(), degree, hold_out)
+    positions = len(campaign.gnss.time)
+    campaign = _without_short_stretches(campaign)
+    dropped = positions - len(campaign.gnss.time)
+    return AlignmentModel(campaign, loss or Quadratic(), degree, hold_out, frame, dropped)
+
+
+def _without_short_stretches(campaign: Campaign) -> Campaign:
+    """The campaign without positions that are too few, far from all others."""
+    gnss = campaign.gnss
+    stretches = stretches_of(gnss.time, orbital_period(campaign))
+    sizes = [s.stop - s.start for s in stretches]
+    if min(sizes) >= FEWEST_SAMPLES:
+        return campaign
+    if max(sizes) < FEWEST_SAMPLES:
+        raise TooFewDataError("no stretch of positions is long enough for a trajectory", where="gnss/time",
+                              value=f"{len(sizes)} stretches of at most {max(sizes)} positions",
+                              limit=f"at least {FEWEST_SAMPLES} positions without a long gap")
+    keep = np.concatenate([np.full(n, n >= FEWEST_SAMPLES) for n in sizes])
+    shorter = replace(gnss, time=gnss.time[keep], position=gnss.position[keep],
+                      standard_deviation=np.broadcast_to(gnss.standard_deviation, gnss.position.shape)[keep])
+    return _without_short_stretches(replace(campaign, gnss=shorter))
 
 
 def alignment_problem(model: AlignmentModel, effects: Sequence[str] = (), *,
@@ -313,7 +416,7 @@ def alignment_problem(model: AlignmentModel, effects: Sequence[str] = (), *,
             need(unknown, value)
         residuals.append(residual)
     need(positions.trajectory, np.zeros(positions.trajectory.manifold.tangent))
-    ordered = [positions, *([doppler] if doppler else []), *residuals]
+    ordered: list[Residual] = [positions, *([doppler] if doppler else []), *residuals]
     held = {e.name for e in dormant if e.name in unknowns}
     commanded = any(u.name == ACTUATOR.name for u in unknowns.values())
     if "inertia_trace" in unknowns and not commanded:
@@ -462,7 +565,7 @@ def _nodes(start: float, samples: np.ndarray, switches: np.ndarray, longest: flo
             merged.append(t)
     required = np.array(merged)
     pieces = [required[:1]]
-    for a, b in zip(required[:-1], required[1:], strict=True):
+    for a, b in pairwise(required):
         steps = int(np.ceil((b - a) / longest - 1e-9))
         pieces.append(a + (b - a) * np.arange(1, steps + 1) / steps)
     nodes = np.concatenate(pieces)
