@@ -79,7 +79,7 @@ class Barron:
         if self.shape == 0:
             return 2 * c2 * np.log1p(s / 2)
         gap = abs(self.shape - 2)
-        return 2 * c2 * gap / self.shape * ((s / gap + 1) ** (self.shape / 2) - 1)
+        return 2 * c2 * gap / self.shape * np.expm1(self.shape / 2 * np.log1p(s / gap))
 
     def weight(self, square: np.ndarray) -> np.ndarray:
         s = square / self.threshold**2
