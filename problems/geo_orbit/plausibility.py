@@ -6,18 +6,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from estimator.models.earth import EQUATORIAL_RADIUS
 from estimator.models.errors import GeometryError, NotFiniteError, UnitError
-from estimator.models.ranging import COMPONENTS
 from estimator.models.station import east_north_up, station_position
 
 if TYPE_CHECKING:
+    from estimator.estimate import Estimate
     from problems.geo_orbit.problem import OrbitModel
 
 LOWEST_RANGE = 100e3  # m, an orbit's height at the least
 HIGHEST_RANGE = 1e9  # m, beyond the Moon
 _BELOW = np.radians(-5.0)  # rad, elevation that no refraction explains
-_SCALES = {"TAI": 0.0, "GPS": -19.0, "TT": 32.184}  # s against TAI
 
 
 def check_observations(model: OrbitModel) -> None:
@@ -172,9 +170,38 @@ def check_start(model: OrbitModel) -> None:
                 limit="above -5 degrees", remedy="check the initial orbit, its epoch and the scale of the times")
 
 
-def components_of(kind: str) -> tuple[str, ...]:
-    """Names of the numbers in one measurement."""
-    return COMPONENTS[kind]
+def suspicious_stations(model: OrbitModel, estimate: Estimate) -> list[str]:
+    """Sentences about stations without which the others agree with one orbit.
 
+    Each station is left out in turn, the rest is solved again from the estimate, and the station is named where that
+    lowers the others' mean square at least a hundredfold, with how far its own data then are from that orbit. A
+    station at a wrong place, or with a wrong clock, shows so. At most eight stations are tried.
+    """
+    from estimator.solvers import Options, solve
 
-__all__ = ["EQUATORIAL_RADIUS", "check_observations", "check_start", "components_of", "kepler", "predicted_elevations"]
+    stations = list(dict.fromkeys(o.name for o in model.tracking.observations))
+    if not 3 <= len(stations) <= 8:
+        return []
+    sentences = []
+    problem = estimate.problem
+    with_all = {r.name: float(np.mean(p.whitened**2)) for r, p in zip(problem.residuals, estimate.parts, strict=True)}
+    best: tuple[float, str, str] | None = None
+    for name in stations:
+        kept = [r for r in problem.residuals if r.name.split("/")[0] != name]
+        free = {u.name for r in kept for u in r.unknowns}
+        part = problem.with_residuals(kept).holding(*(u.name for u in problem.free if u.name not in free))
+        again = solve(part.starting_at(problem.start), Options(iterations=25))
+        before = float(np.mean([with_all[r.name] for r in kept]))
+        after = float(np.mean([np.mean(p.whitened**2) for p in again.parts]))
+        if before > 100.0 and after < 0.01 * before and (best is None or after < best[0]):
+            left = [r for r in problem.residuals if r.name.split("/")[0] == name]
+            gaps = [f"{np.sqrt(np.mean(r.linearize(again.values).residual ** 2)):.4g} {r.unit} in {r.channel}"
+                    for r in left]
+            best = (after, name, " and ".join(gaps))
+    if best is not None:
+        place = model.station(best[1].split(">")[-1])
+        sentences.append(
+            f"the other stations agree with one orbit, from which {best[1]} is off by {best[2]}: check its latitude "
+            f"({np.degrees(place.latitude):.4f} degrees), longitude ({np.degrees(place.longitude):.4f} degrees, east "
+            "positive), clock and bias")
+    return sentences

@@ -85,7 +85,7 @@ class Tracking:
         for o in (*self.observations, *other.observations):
             groups.setdefault((o.kind, o.transmitter, o.receiver), []).append(o)
         return Tracking(tuple(_joined(g) for g in groups.values()), {**self.stations, **other.stations},
-                        _deep(self.settings, other.settings), self.satellite or other.satellite)
+                        deep_merged(self.settings, other.settings), self.satellite or other.satellite)
 
 
 def _joined(group: list[Observations]) -> Observations:
@@ -99,8 +99,9 @@ def _joined(group: list[Observations]) -> Observations:
                         np.concatenate(lines)[order])
 
 
-def _deep(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
+def deep_merged(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
+    """Nested tables with those of ``b`` over those of ``a``."""
     merged = dict(a)
     for key, value in b.items():
-        merged[key] = _deep(merged[key], value) if isinstance(value, dict) and isinstance(merged.get(key), dict) else value
+        merged[key] = deep_merged(merged[key], value) if isinstance(value, dict) and isinstance(merged.get(key), dict) else value
     return merged
