@@ -37,6 +37,7 @@ Array = NDArray[np.float64]
 AZIMUTH_LIMIT = math.pi / 9  # rad, of the scans from the ground track (Somov et al., section 2)
 OVERLAP_GUARD = 2e-4  # added to the asked overlap
 END_GUARD = 60.0  # m, by which a detector line passes the end of the area
+END_TIME = 0.1  # s of scanning added at each end, so that a file with this step still shows the area covered
 MOST_SCANS = 40  # in one pass
 PITCH_RATE = 0.008  # rad/s, rough rate at which the pitch of a ground point falls: scales the centring step only
 
@@ -155,7 +156,7 @@ class PassPlanner:
         return make_scan(self.arc, self.camera, line, 0.0 if forward else length, length if forward else 0.0, start,
                          self.rate, kind_of_motion=self.area.image_motion, turned=self.area.reversal == "yaw")
 
-    def _needed_ends(self, shape: Outline) -> tuple[float, float]:
+    def _needed_ends(self, shape: Outline, speed: float) -> tuple[float, float]:
         """How far (m) the near and the far end fall short of the area's ends, inside the area's width."""
         half = self.area.width / 2
         answers = []
@@ -163,7 +164,7 @@ class PassPlanner:
             limits = np.clip([end[0, 1], end[-1, 1]], -half, half)
             across = np.linspace(limits[0], limits[1], 33)
             along = np.interp(across, end[:, 1], end[:, 0])
-            answers.append(float(np.max(sign * along)) + self.area.length / 2 + END_GUARD)
+            answers.append(float(np.max(sign * along)) + self.area.length / 2 + END_GUARD + END_TIME * speed)
         return answers[0], answers[1]
 
     def swath(self, across: float, time: float) -> float:
@@ -218,7 +219,7 @@ class PassPlanner:
                 scans.append(scan)
             shapes = [outline(s, self.plane) for s in (scans if pattern.from_left else scans[::-1])]
             placed = tuple(replace(s) for s in strips)
-            change, complete = self._move(strips, shapes, fill)
+            change, complete = self._move(strips, shapes, _speeds(scans, pattern), fill)
             lag = self._lag(scans, shift)
             if change < tolerance and abs(lag) < (0.3 if coarse else 0.05) and worst_gap < (0.1 if coarse else 5e-3):
                 break
@@ -242,7 +243,7 @@ class PassPlanner:
         limits = self.limits
         return 2 * math.sqrt(math.radians(6.0) / limits.acceleration) + limits.acceleration / limits.jerk
 
-    def _move(self, strips: list[Strip], shapes: list[Outline], fill: bool) -> tuple[float, bool]:
+    def _move(self, strips: list[Strip], shapes: list[Outline], speeds: list[float], fill: bool) -> tuple[float, bool]:
         """Move the strips towards the asked overlap and ends; the largest move (m) and whether the area is covered."""
         area, half = self.area, self.area.width / 2
         stations = np.linspace(-area.length / 2, area.length / 2, self.stations)
@@ -282,10 +283,10 @@ class PassPlanner:
             if index < count - 1:
                 move += spare[index] - gaps[index]
         largest = 0.0
-        for strip, shape, step in zip(strips, shapes, moves, strict=True):
+        for strip, shape, speed, step in zip(strips, shapes, speeds, moves, strict=True):
             # A positive step moves the strip to the right by the length that it has to spare on its left.
             strip.across += step
-            near, far = self._needed_ends(shape)
+            near, far = self._needed_ends(shape, speed)
             strip.near -= near
             strip.far += far
             largest = max(largest, abs(step), abs(near), abs(far))
@@ -376,7 +377,7 @@ class PassPlanner:
             scans, joins = self._with_slews(fine.pattern, strips, begin, guesses, 0.02)
             guesses = list(joins)
             shapes = [outline(s, self.plane) for s in (scans if fine.pattern.from_left else scans[::-1])]
-            change, complete = self._move(strips, shapes, fill)
+            change, complete = self._move(strips, shapes, _speeds(scans, fine.pattern), fill)
             lag = self._lag(scans, shift)
             if change < 10.0 and abs(lag) < 0.1:
                 break
@@ -402,6 +403,12 @@ class PassPlanner:
             joins.append(join)
             scans.append(scan)
         return tuple(scans), tuple(joins)
+
+
+def _speeds(scans: Sequence[Scan], pattern: Pattern) -> list[float]:
+    """Ground speeds (m/s) of the scans in rising order across."""
+    speeds = [s.length / s.duration for s in scans]
+    return speeds if pattern.from_left else speeds[::-1]
 
 
 def edges_at(shape: Outline, stations: Array) -> tuple[Array, Array]:

@@ -267,9 +267,9 @@ def globe(plan: SurveyPlan, *, frames: int = 160) -> Any:
     side = np.cross([0.0, 0.0, 1.0], direction)
     side = side / max(1e-9, float(np.linalg.norm(side)))
     bound = 1.15 * EQUATORIAL_RADIUS / 1e3
-    eye = direction * 0.86 + 0.18 * side - 0.16 * np.array([0.0, 0.0, 1.0])
     # Scene coordinates: the ranges below map the Earth's radius to 0.5 / 1.15.
     target = direction * 0.5 * POLAR_RADIUS / 1e3 / bound
+    eye = target + 0.2 * direction + 0.1 * side - 0.08 * np.array([0.0, 0.0, 1.0])
     hidden = {"visible": False, "showbackground": False, "range": [-bound, bound]}
     figure = go.Figure(data=data, frames=steps)
     epoch = plan.request.orbit.epoch
