@@ -242,6 +242,21 @@ class AlignmentModel:
                 beam_direction=beams[m] if beams.ndim == 3 else beams))
         return starting_point(campaign, self.velocity, self.position)
 
+    def tracker_velocity(self, antenna_from_tracker: np.ndarray | None = None) -> np.ndarray:
+        """Unit vectors (n, 3) of the Earth-fixed velocity at the used Doppler epochs, tracker axes, from the measured
+        attitude; with a mounting (4,) given, antenna axes."""
+        from scipy.spatial.transform import Rotation
+
+        assert self.campaign.doppler is not None
+        time = self.campaign.doppler.time[self.doppler_epochs]
+        angle = self.earth_angle(time)
+        velocity = Rotation.from_rotvec(np.column_stack([0 * angle, 0 * angle, angle])).apply(self.velocity(time))
+        turned = Rotation.from_quat(self._attitude_at_doppler.quaternion[self.doppler_epochs], scalar_first=True)
+        if antenna_from_tracker is not None:
+            turned = Rotation.from_quat(antenna_from_tracker, scalar_first=True) * turned
+        velocity = turned.apply(velocity)
+        return np.asarray(velocity / np.linalg.norm(velocity, axis=1, keepdims=True))
+
     @cached_property
     def session_of_epoch(self) -> tuple[np.ndarray, tuple[str, ...]]:
         """Index of the Doppler arc of each used epoch, and the arcs' names; stretches without an arc get their own."""

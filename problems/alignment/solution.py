@@ -21,6 +21,7 @@ from estimator.models.inertia import matrix_of
 from estimator.solvers import Options, solve, solve_with_ipopt
 from estimator.unknowns import NormalizedInertia
 from problems.alignment.campaign import Campaign
+from problems.alignment.determined_rotation import DeterminedTurn, determined_turns, squint
 from problems.alignment.problem import AlignmentModel, alignment_model, alignment_problem
 from problems.alignment.screening import Screening, screen
 
@@ -102,10 +103,10 @@ class AlignmentSolution:
         inertia, covariance = self.normalized_inertia, self.inertia_covariance()
         sigma = None
         if covariance is not None:
-            s = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+            e = np.sqrt(np.maximum(np.diag(covariance), 0.0))
             if np.isinf(self.estimate.sigma_of("normalized_inertia")).any():
-                s = np.full(6, np.inf)
-            sigma = [[s[0], s[3], s[4]], [s[3], s[1], s[5]], [s[4], s[5], s[2]]]
+                e = np.full(6, np.inf)
+            sigma = [[e[0], e[3], e[4]], [e[3], e[1], e[5]], [e[4], e[5], e[2]]]
         answer: dict[str, Any] = {
             "status": str(self.status),
             "why": self.why,
@@ -134,8 +135,14 @@ class AlignmentSolution:
         quaternion = self._quaternion(name)
         if quaternion is None:
             return {"quaternion": None, "sigma_rad": None}
-        return {"quaternion": quaternion, "sigma_rad": self.estimate.sigma_of(name), "sigma_axes": axes,
-                "covariance_rad2": self.estimate.covariance_of(name)}
+        answer = {"quaternion": quaternion, "sigma_rad": self.estimate.sigma_of(name), "sigma_axes": axes,
+                  "covariance_rad2": self.estimate.covariance_of(name)}
+        turns = determined_turns(self.estimate, name, getattr(self.model.campaign.nominal, name))
+        if turns:
+            answer["determined"] = [turn.as_dict() for turn in turns]
+            if name == "antenna_from_tracker" and (found := beam_squint(self.model, self.estimate)) is not None:
+                answer["squint"] = found.as_dict()
+        return answer
 
     def _effects(self) -> list[dict[str, Any]]:
         described = []
@@ -154,6 +161,18 @@ class AlignmentSolution:
         lines = [f"{self.model.campaign.title or 'alignment campaign'}", "", f"{self.status}: {self.why}"]
         body = str(self.estimate).split("\n", 1)[1]
         return "\n".join(lines) + "\n" + body + f"\n\ntrajectory degree {self.model.frame.degree}, {self.seconds:.2f} s"
+
+
+def beam_squint(model: AlignmentModel, estimate: Estimate) -> DeterminedTurn | None:
+    """How far the beams look ahead of where they would by design; None where that is not determined."""
+    doppler = model.campaign.doppler
+    assert doppler is not None
+    index = model.doppler_epochs
+    beams = doppler.beam_direction
+    beams = beams[index] if beams.ndim == 3 else np.broadcast_to(beams, (len(index), *beams.shape))
+    velocity = model.tracker_velocity(estimate.values["antenna_from_tracker"])
+    return squint(estimate, "antenna_from_tracker", model.campaign.nominal.antenna_from_tracker,
+                  beams / np.linalg.norm(beams, axis=2, keepdims=True), velocity)
 
 
 def kept(campaign: Campaign, screening: Screening) -> Campaign:
@@ -234,8 +253,17 @@ def concluded(model: AlignmentModel, estimate: Estimate, screening: Screening, s
             why = []
         status = max(status, Status.UNOBSERVABLE, key=lambda s: s.gravity)
         why.append("this campaign cannot determine " + "; ".join(m.replace(": ", " (", 1) + ")" for m in missing))
+    if "antenna_from_tracker" in names and determined_turns(
+            estimate, "antenna_from_tracker", model.campaign.nominal.antenna_from_tracker):
+        found = beam_squint(model, estimate)
+        if found is not None:
+            milli = 1e3 * np.rad2deg(1.0)
+            why.append(f"the squint of the beams is determined: {milli * found.angle:+.3g} millidegrees, sigma "
+                       f"{milli * found.sigma:.2g} from the declared noise, {milli * found.scatter:.2g} from the "
+                       "scatter of the residuals along the sessions")
     if screening.rejected():
         why.append(screening.sentence())
+    why += model.left_out
     if model.skipped_arcs:
         why.append("too few star tracker samples in " + ", ".join(model.skipped_arcs))
-    return AlignmentSolution(model, estimate, screening, status, ". ".join(why), tuple([*missing, *weak]), seconds)
+    return AlignmentSolution(model, estimate, screening, status, ". ".join(why), (*missing, *weak), seconds)

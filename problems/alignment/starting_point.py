@@ -259,12 +259,26 @@ def _antenna(campaign: Campaign, velocity: TimeFunction, notes: list[str]) -> tu
             _fit_antenna(campaign, index, v_tracker, sigma, nominal, Rotation.from_rotvec(s) * nominal) for s in steps
         ]
     rotation, quality, open_axes = min(fits, key=lambda f: f[1].residual)
+    for _ in range(3):
+        # What the data leave open must not follow their noise: fitted again with the design value kept there.
+        if not open_axes:
+            break
+        kept = np.array(open_axes)
+        rotation = _kept_at_design(rotation, nominal, kept)
+        rotation, quality, open_axes = _fit_antenna(campaign, index, v_tracker, sigma, nominal, rotation, kept)
+        rotation = _kept_at_design(rotation, nominal, kept)
     for axis in open_axes:
         words = ", ".join(f"{x:+.2f}" for x in axis)
         notes.append(
             f"antenna: the rotation about ({words}) in antenna axes is not determined; the design value is kept"
         )
     return quaternion_of(rotation), quality
+
+
+def _kept_at_design(rotation: Rotation, nominal: Rotation, axes: np.ndarray) -> Rotation:
+    """The rotation without its turns away from the design value about given axes (k, 3), orthonormal."""
+    offset = (rotation * nominal.inv()).as_rotvec()
+    return Rotation.from_rotvec(offset - axes.T @ (axes @ offset)) * nominal
 
 
 def _fit_antenna(
@@ -274,8 +288,13 @@ def _fit_antenna(
     tracker_sigma: np.ndarray,
     nominal: Rotation,
     start: Rotation,
+    kept: np.ndarray | None = None,
 ) -> tuple[Rotation, Quality, list[np.ndarray]]:
-    """Robust Gauss-Newton on the three angles from ``start``, with the design value as a weak prior."""
+    """Robust Gauss-Newton on the three angles from ``start``, with the design value as a weak prior.
+
+    Steps have no part along the axes ``kept`` (k, 3), orthonormal in antenna axes.
+    """
+    free = np.eye(3) if kept is None else np.linalg.svd(kept)[2][len(kept) :].T
     doppler = campaign.doppler
     assert doppler is not None
     gain = 2 * doppler.carrier_frequency / speed_of_light
@@ -296,7 +315,8 @@ def _fit_antenna(
         information = jacobian.T @ (weight[:, None] * jacobian)
         prior = np.eye(3) / ANTENNA_PRIOR**2
         offset = (rotation * nominal.inv()).as_rotvec()
-        step = np.linalg.solve(information + prior, jacobian.T @ (weight * whitened) - prior @ offset)
+        right = jacobian.T @ (weight * whitened) - prior @ offset
+        step = free @ np.linalg.solve(free.T @ (information + prior) @ free, free.T @ right)
         length = float(np.linalg.norm(step))
         rotation = Rotation.from_rotvec(step * min(1.0, 0.5 / max(length, 1e-15))) * rotation
         if length < 1e-9 or (length < 1e-6 and abs(scale - previous_scale) < 1e-6):
