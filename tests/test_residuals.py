@@ -73,8 +73,8 @@ def assert_jacobian(kernel: Kernel, point: dict[str, np.ndarray], samples: int, 
 
 def environment(rng, samples):
     """Rows of the environment table in the order of the declaration, of realistic size."""
-    from estimator.models.environment import environment_table
     from estimator.effects.declaration import ENVIRONMENT
+    from estimator.models.environment import environment_table
 
     time = np.sort(rng.uniform(0, 5000.0, samples))
     radius, speed = 7071e3, 7508.0
