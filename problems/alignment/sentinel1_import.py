@@ -313,6 +313,13 @@ def import_sentinel1(
 
 def campaign_of(annotations: Sequence[Annotation], orbit_files: Sequence[OrbitFile] = ()) -> Campaign:
     """See :func:`import_sentinel1`; from files already read."""
+    return campaign_with_swaths(annotations, orbit_files)[0]
+
+
+def campaign_with_swaths(
+    annotations: Sequence[Annotation], orbit_files: Sequence[OrbitFile] = ()
+) -> tuple[Campaign, tuple[str, ...]]:
+    """The campaign of :func:`campaign_of`, and the name of the sub-swath that each row of its Doppler data is from."""
     if not annotations:
         raise RequestError("there is no annotation to import", remedy="name at least one annotation XML file")
     for what, values in (
@@ -346,7 +353,7 @@ def campaign_of(annotations: Sequence[Annotation], orbit_files: Sequence[OrbitFi
                 limit=f"{annotations[0].mission}, {utc_text(annotations[0].start)}",
                 remedy="leave it out, or add the annotation that it belongs to",
             )
-    return checked(_assembled(annotations, parts))
+    return checked(_assembled(annotations, parts)), tuple(swath for part in parts for swath in part.swaths)
 
 
 @dataclass(frozen=True)
@@ -361,6 +368,7 @@ class _Part:
     beams: np.ndarray
     attitude_time: np.ndarray
     celestial_from_body: Rotation
+    swaths: tuple[str, ...]
 
 
 def _acquisitions(annotations: Sequence[Annotation]) -> list[list[Annotation]]:
@@ -388,7 +396,7 @@ def _acquisition_data(group: list[Annotation], orbit_files: Sequence[OrbitFile],
         times[k] = max(times[k], times[k - 1] + np.timedelta64(1, "us"))
     if not chosen:
         none = np.zeros((0, 3))
-        return _Part(name, orbit, times, none, none, np.zeros((0, 3, 3)), times, Rotation.identity(0))
+        return _Part(name, orbit, times, none, none, np.zeros((0, 3, 3)), times, Rotation.identity(0), ())
     slant = np.empty((times.size, _NODES.size))
     frequency = np.empty_like(slant)
     deviation = np.empty_like(slant)
@@ -406,7 +414,8 @@ def _acquisition_data(group: list[Annotation], orbit_files: Sequence[OrbitFile],
     attitude_time = np.concatenate([attitude.time[apart], times])
     rotation = body if sample is None else Rotation.concatenate([sample, body])
     order = np.argsort(attitude_time, kind="stable")
-    return _Part(name, orbit, times, frequency, deviation, beams, attitude_time[order], rotation[order])
+    swaths = tuple(annotation.swath for annotation, _ in chosen)
+    return _Part(name, orbit, times, frequency, deviation, beams, attitude_time[order], rotation[order], swaths)
 
 
 def _merged_attitude(group: list[Annotation]) -> AttitudeVectors:
