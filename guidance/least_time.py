@@ -63,7 +63,7 @@ def least_feasible_time(ratio: Callable[[Array, int], Array], lower: float, *, r
     coarse = 48 if not accurate else 96
     grid = lower * np.geomspace(1.0, reach, 64)
     good = np.flatnonzero(ratio(grid, coarse) <= 1)
-    for first in good:
+    for first in good[:4]:
         low, high = (grid[first - 1], grid[first]) if first else (lower, grid[first])
         if first == 0:
             low = lower

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -29,17 +29,18 @@ from guidance.slew_bounds import lower_bound
 from guidance.slew_envelope import Envelope, envelope_of
 from guidance.slew_problem import ROW_NAMES, STAGE, STATE, Extras, transcription
 from guidance.slew_request import Limits, SlewRequest
-from guidance.slew_start import PARTS, eigenaxis_profile, interpolated, starting_motion, switching_mesh
+from guidance.slew_start import PARTS, eigenaxis_profile, even_mesh, interpolated, starting_motion, switching_mesh
 
 Array = np.ndarray
 
 _MARGIN = 2e-7  # relative: the limits inside the solver, so that its tolerance does not break them outside
 _PERMITTED = 1e-6  # relative: the most that a certified slew may exceed a limit
-_NEAR_PROFILE = 0.006  # relative: an optimum this near the eigenaxis profile has its switches,
-_NEARER = 0.002  # and this near where the ends accelerate
+_ACROSS = 0.22  # rates across the eigenaxis, over the root of angle times acceleration: above it no mesh is guessed
+_NEAR_PROFILE = 0.015  # relative: an optimum this near the eigenaxis profile has its switches,
+_NEARER = 0.004  # and this near where the ends accelerate
 _FINE = 40  # intervals of a refined mesh
 _REFINEMENTS = 3  # at most
-_SETTLED = 1.5e-4  # relative gain of a refinement below which there is no other
+_SETTLED = 4e-4  # relative gain of a refinement below which there is no other
 _LAST_PIECE = 1e-3  # of the time to build up the acceleration: length of the piece with the jerk asked for at the stop
 
 
@@ -275,7 +276,7 @@ def _one_way(request: SlewRequest, limits: Limits, envelope: Envelope, long_way:
     plain = speed.fits and not envelope.extras.rows and request.objective == "time"
     alone = not any(np.linalg.norm(v - (v @ axis) * axis) > 1e-12 * limits.rate for e in (request.start, request.stop)
                     for v in (e.rate, e.acceleration))
-    still = not (np.any(request.start.acceleration) or np.any(request.stop.acceleration))
+    pushed = max(float(np.linalg.norm(e.acceleration)) for e in (request.start, request.stop)) / limits.acceleration
     spent, best = 0, None
 
     def attempt(what: str, *args: Any, options: dict[str, Any] | None = None) -> _Attempt:
@@ -294,19 +295,22 @@ def _one_way(request: SlewRequest, limits: Limits, envelope: Envelope, long_way:
         return result
 
     quick = _QUICK if name == "ipopt" else {}
+    across = max(float(np.linalg.norm(e.rate - (e.rate @ axis) * axis)) for e in (request.start, request.stop))
+    difficult = pushed > 0.1 or across > _ACROSS * np.sqrt(max(speed.angle, 1e-9) * limits.acceleration)
     if speed.fits and speed.duration > 0:
-        mesh = switching_mesh(speed, limits, exact=alone)
+        usual = plain and not difficult
+        mesh = switching_mesh(speed, limits, exact=alone) if usual else even_mesh(speed.duration, limits, _FINE)
         first = attempt("from the eigenaxis profile", mesh, *starting_motion(request, axis, speed, mesh), options=quick)
-        if plain and first.success and abs(first.duration / speed.duration - 1) < (_NEAR_PROFILE if still else _NEARER):
+        if usual and first.success and abs(first.duration / speed.duration - 1) < (_NEARER if pushed > 0.02 else _NEAR_PROFILE):
             return first, spent
-    if best is None or not best.success or not plain:
+    if best is None or not best.success:
         bound = max(lower_bound(request, limits, long_way=long_way), 1e-3)
-        start = _uniform_start(request, limits, long_way, bound, 32)
+        start = _uniform_start(request, limits, long_way, bound, _FINE)
         if start is not None:
             attempt("from the polynomial", *start)
         if best is None or not best.success:
             duration = 2 * max(bound, speed.duration, 1e-3)
-            mesh = np.full(32, 1 / 32)
+            mesh = np.full(_FINE, 1 / _FINE)
             sigma, rate, acceleration, _ = starting_motion(request, axis, replace(
                 speed, durations=np.maximum(speed.durations, duration / 7)), mesh)
             attempt("from a slower start", mesh, sigma, rate, acceleration, duration)
@@ -344,6 +348,10 @@ def optimal_slew(request: SlewRequest, *, near: Optimum | None = None) -> Optimu
             return Optimum(profile, near.long_way, seconds, again[1].iterations, again[1].solver,
                            ("from the neighbouring answer",), again[2])
         steps.append("the neighbouring answer did not help")
+    if inner.objective == "smoothness" and inner.duration is not None:
+        quickest = optimal_slew(replace(inner, objective="time", duration=None))
+        if quickest.duration > inner.duration:
+            raise _too_short(quickest.duration, inner.duration)
     best: _Attempt | None = None
     best_way, total = False, 0
     failures: list[_Attempt] = []
@@ -361,8 +369,7 @@ def optimal_slew(request: SlewRequest, *, near: Optimum | None = None) -> Optimu
         elif best is None or found.duration < best.duration:
             best, best_way = found, long_way
     if best is None:
-        _explain_failure(request, limits, failures)
-    assert best is not None
+        _explain_failure(failures)
     profile = _profile(inner, limits, best)
     if envelope.extras.rows:
         profile, best, more = _tightened(inner, limits, envelope, best_way, best, profile, steps)
@@ -432,16 +439,16 @@ def _tightened(request: SlewRequest, limits: Limits, envelope: Envelope, long_wa
     return profile, attempt, spent
 
 
-def _explain_failure(request: SlewRequest, limits: Limits, failures: list[_Attempt]) -> None:
+def _too_short(needed: float, duration: float) -> InfeasibleError:
+    ratio = needed / duration
+    return InfeasibleError(
+        f"the duration {duration:.6g} s is too short: the quickest slew within the limits takes {needed:.6g} s; keeping "
+        f"it needs limits about {ratio:.4g} (rate), {ratio**2:.4g} (acceleration) and {ratio**3:.4g} (jerk) times as "
+        "large", limit="duration", excess=needed - duration)
+
+
+def _explain_failure(failures: list[_Attempt]) -> NoReturn:
     """Raise the error that says which limit stood in the way, and by how much."""
-    if request.objective == "smoothness" and request.duration is not None:
-        quickest = optimal_slew(replace(request, objective="time", duration=None))
-        needed = quickest.duration
-        ratio = needed / request.duration
-        raise InfeasibleError(
-            f"the duration {request.duration:.6g} s is too short: the quickest slew within the limits takes "
-            f"{needed:.6g} s; keeping it needs limits about {ratio:.4g} (rate), {ratio**2:.4g} (acceleration) and "
-            f"{ratio**3:.4g} (jerk) times as large", limit="duration", excess=needed - request.duration)
     if not failures:
         raise InfeasibleError("no starting point was found", limit="", excess=None)
     worst = min(failures, key=lambda a: a.worst[1])

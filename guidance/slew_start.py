@@ -140,6 +140,13 @@ def switching_mesh(profile: SpeedProfile, limits: Limits, *, exact: bool = False
     return lengths / np.sum(lengths)
 
 
+def even_mesh(duration: float, limits: Limits, count: int) -> Array:
+    """Fractions (count,) of the duration: three intervals in the first and the last bend of the jerk, the rest even."""
+    bend = min(limits.acceleration / limits.jerk / duration, 0.12)
+    ends = np.full(3, bend / 3)
+    return np.concatenate([ends, np.full(count - 6, (1 - 2 * bend) / (count - 6)), ends])
+
+
 def _graded(length: float, count: int, fine_start: bool, fine_stop: bool) -> Array:
     """``count`` intervals of a segment, shorter towards the ends that are to be fine."""
     s = np.linspace(0, 1, count + 1)
