@@ -130,7 +130,8 @@ def strangers(layout: Any) -> dict[str, Any]:
         return ca.vertcat(0, 0, p[0] * ca.sin(2 * ca.pi * sample.time / 37.0))
 
     def periodic(sample: Any, p: Any) -> Any:
-        return ca.vertcat(p[0] * ca.sin(2 * ca.pi * sample.time / 23.0), p[0] * ca.cos(2 * ca.pi * sample.time / 23.0), 0)
+        angle = 2 * ca.pi * sample.time / 23.0
+        return p[0] * ca.vertcat(ca.sin(angle), ca.cos(angle), 0)
 
     def made(name: str, channel: Any, p: Any, function: Any) -> Any:
         return EffectInstance(name, name, channel, (p,), function, zero="size = 0", reference="none")

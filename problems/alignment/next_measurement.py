@@ -159,13 +159,14 @@ def _information(problem: Problem, parts: Sequence[Linearization], effects: Mapp
     own = [u.name for u in problem.unknowns if u.name not in SHARED and u.name not in effects]
     held = {"inertia_trace"} & set(problem.held)
     eliminated = np.concatenate([np.zeros(0, dtype=int), *(np.arange(columns[n].start, columns[n].stop) for n in own)])
-    kept, labels = [], []
+    places: list[int] = []
+    labels: list[str] = []
     for u in problem.unknowns:
         if u.name in own or u.name in held:
             continue
-        kept += list(range(columns[u.name].start, columns[u.name].stop))
+        places += list(range(columns[u.name].start, columns[u.name].stop))
         labels += [u.name] * u.manifold.tangent
-    kept += list(range(total, total + len(signatures)))
+    kept = np.array([*places, *range(total, total + len(signatures))], dtype=int)
     labels += ["*" + n for n in signatures]
     inner = gram[np.ix_(eliminated, eliminated)] + 1e-9 * np.eye(len(eliminated))
     cross = gram[np.ix_(eliminated, kept)]
@@ -179,15 +180,15 @@ def _sum(parts: Sequence[_Information]) -> _Information:
     placed = []
     for part in parts:
         seen: dict[str, int] = {}
-        index = []
+        index: list[int] = []
         for label in part.labels:
             key = (label, seen.get(label, 0))
             seen[label] = key[1] + 1
             index.append(keys.setdefault(key, len(keys)))
         placed.append(np.array(index, dtype=int))
     matrix = np.zeros((len(keys), len(keys)))
-    for part, index in zip(parts, placed, strict=True):
-        matrix[np.ix_(index, index)] += part.matrix
+    for part, place in zip(parts, placed, strict=True):
+        matrix[np.ix_(place, place)] += part.matrix
     return _Information(tuple(label for label, _ in keys), matrix)
 
 
