@@ -148,8 +148,9 @@ class TrajectoryResidual:
             projected = self.block.project(signature, axis)
             felt = directions.T @ projected
             size = directions.shape[1]
-            rows.append(zeta[start : start + size] - felt[:, 0])
-            row_jacobians.append((start, -felt[:, 1:]))
+            # The trajectory has to take up what the effects leave: measured = trajectory + contribution.
+            rows.append(zeta[start : start + size] + felt[:, 0])
+            row_jacobians.append((start, felt[:, 1:]))
             start += size
             weight = self.weights[:, axis]
             outside = np.column_stack([fit[:, axis] - signature[:, 0], -signature[:, 1:]])
