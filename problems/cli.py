@@ -28,8 +28,8 @@ COMMANDS: dict[str, str | dict[str, str]] = {
     "slew": "problems.area_survey.commands_slew:slew",
     "survey": "problems.area_survey.commands_survey:survey",
     "orbit": {
-        "solve": "problems.geo_orbit.commands:solve",
-        "explain": "problems.geo_orbit.commands:explain",
+        "solve": "problems.geo_orbit.commands:solve_command",
+        "explain": "problems.geo_orbit.commands:explain_command",
     },
     "stars": "problems.star_configuration.commands:stars",
     "demo": "problems.alignment.commands_demo:demo",

@@ -5,7 +5,8 @@
 Five quantities are compared: rotations by the angle of the rotation that is left between estimate and truth, two
 ratios of principal moments by their difference, the principal axes by the angle between both triads. The Cramer-Rao
 bound of each is the root of the trace of the joint estimate's covariance of the same quantity, so a method at the bound
-has errors of about one sigma.
+has errors of about one sigma. It is the bound of the joint model: the attitude of each Doppler epoch is known from the
+star tracker's sample there and from nothing else.
 """
 
 from __future__ import annotations
@@ -26,17 +27,21 @@ from scipy.stats import chi2
 from estimator.models.errors import RequestError
 from estimator.models.files import written_atomically
 from estimator.models.inertia import entries_of, matrix_of
+from problems.alignment.attitude_at_epochs import attitude_at_epochs
+from problems.alignment.campaign import Campaign
 from problems.alignment.closed_form import ClosedFormEstimate, closed_form
+from problems.alignment.simulation.truth import Truth
 from problems.alignment.solution import AlignmentSolution, solve_campaign
-from problems.alignment.starting_point import StartingPoint
+from problems.alignment.starting_point import earth_fixed_from_inertial, quaternion_of, velocity_from_beams, wahba
 from problems.console import jsonable
 
 ARCSECOND = np.pi / 648000.0  # rad
+COPLANAR = 0.01  # reciprocal condition of three beams below which they give no velocity
 ELLIPSOID_LEVEL = 0.9973  # probability inside three standard deviations of one normal variable
 
 METHODS = {
     "joint": "joint estimate",
-    "starting_point": "Wahba, momentum, polar",
+    "linear": "Wahba, momentum, polar",
     "closed_form": "closed form, corrected",
     "closed_form_literal": "closed form, as printed",
 }
@@ -153,13 +158,13 @@ def _chi2(solution: AlignmentSolution, name: str, truth: np.ndarray) -> Block | 
                  float(error @ np.linalg.solve(covariance, error)), float(chi2.ppf(ELLIPSOID_LEVEL, len(error))))
 
 
-def compared(solution: AlignmentSolution, truth: Any, others: Mapping[str, StartingPoint | ClosedFormEstimate]
-             ) -> Comparison:
+def compared(solution: AlignmentSolution, truth: Truth,
+             others: Mapping[str, LinearEstimate | ClosedFormEstimate]) -> Comparison:
     """Errors of the joint estimate and of other methods against the truth.
 
     Args:
         solution: the joint estimate.
-        truth: :class:`problems.alignment.simulation.truth.Truth` of the same campaign.
+        truth: of the same campaign.
         others: results of other methods by key, see ``METHODS``.
     """
     methods: dict[str, Any] = {"joint": solution, **others}
@@ -193,7 +198,7 @@ def compared(solution: AlignmentSolution, truth: Any, others: Mapping[str, Start
     return Comparison((quantities[0], *inertia, quantities[1]), tuple(b for b in blocks if b is not None))
 
 
-def trajectory_errors(solution: AlignmentSolution, truth: Any) -> tuple[float, float]:
+def trajectory_errors(solution: AlignmentSolution, truth: Truth) -> tuple[float, float]:
     """RMS error of the estimated Earth-fixed position (m) and velocity (m/s), per axis, over the whole campaign."""
     residual = solution.estimate.problem.residuals[0]
     sampled = solution.model.campaign.gnss.time
@@ -207,30 +212,61 @@ def trajectory_errors(solution: AlignmentSolution, truth: Any) -> tuple[float, f
     return errors[0], errors[1]
 
 
-def all_methods(campaign: Any, truth: Any) -> tuple[AlignmentSolution, Comparison]:
-    """The joint estimate of a campaign and the errors of every method."""
-    solution = solve_campaign(campaign)
-    others: dict[str, StartingPoint | ClosedFormEstimate] = {
-        "starting_point": solution.model.start,
-        "closed_form": closed_form(campaign, "corrected"),
-        "closed_form_literal": closed_form(campaign, "literal"),
-    }
-    return solution, compared(solution, truth, _determined_only(solution, others))
-
-
-def _determined_only(solution: AlignmentSolution, others: dict[str, Any]) -> dict[str, Any]:
-    """The other methods, with what they merely take from the design values left out."""
-    start = others["starting_point"]
-    kept = {name: getattr(start, name) if getattr(solution, name) is not None else None
-            for name in ("antenna_from_tracker", "actuator_from_tracker", "normalized_inertia")}
-    return {**others, "starting_point": _Known(**kept)}
-
-
 @dataclass(frozen=True)
-class _Known:
+class LinearEstimate:
+    """What the linear methods give; None where the campaign has no data for it.
+
+    Attributes:
+        antenna_from_tracker: (4,) Wahba's solution over all Doppler epochs, equal weights, each with the attitude that
+            was measured there.
+        actuator_from_tracker: (4,) by polar decomposition of the map from command to torque.
+        normalized_inertia: (3, 3) from the constancy of the angular momentum.
+    """
+
     antenna_from_tracker: np.ndarray | None
     actuator_from_tracker: np.ndarray | None
     normalized_inertia: np.ndarray | None
+
+
+def linear_estimate(solution: AlignmentSolution) -> LinearEstimate:
+    """The linear methods on the campaign of a joint estimate.
+
+    The antenna is not taken from the starting point of the joint estimate, because that smooths the attitude over a
+    session: it knows more than the joint model, in which every epoch has an attitude of its own.
+    """
+    start, known = solution.model.start, solution
+    return LinearEstimate(
+        _wahba(solution) if known.antenna_from_tracker is not None else None,
+        start.actuator_from_tracker if known.actuator_from_tracker is not None else None,
+        start.normalized_inertia if known.normalized_inertia is not None else None,
+    )
+
+
+def _wahba(solution: AlignmentSolution) -> np.ndarray | None:
+    campaign, index = solution.model.campaign, solution.model.doppler_epochs
+    doppler = campaign.doppler
+    if doppler is None or doppler.frequency_shift.shape[1] < 3:
+        return None
+    time = doppler.time[index]
+    attitude = attitude_at_epochs(campaign.star_tracker, doppler.time).quaternion[index]
+    fixed_from_inertial = earth_fixed_from_inertial(campaign, time)
+    inertial = fixed_from_inertial.inv().apply(solution.model.velocity(time))
+    in_tracker = Rotation.from_quat(attitude, scalar_first=True).apply(inertial)
+    in_antenna, reciprocal = velocity_from_beams(doppler, index)
+    good = np.all(np.isfinite(in_antenna), axis=1) & (reciprocal > COPLANAR)
+    if np.sum(good) < 2:
+        return None
+    return quaternion_of(wahba(in_antenna[good], in_tracker[good], np.ones(int(np.sum(good)))))
+
+
+def all_methods(campaign: Campaign, truth: Truth) -> tuple[AlignmentSolution, Comparison]:
+    """The joint estimate of a campaign and the errors of every method."""
+    solution = solve_campaign(campaign)
+    return solution, compared(solution, truth, {
+        "linear": linear_estimate(solution),
+        "closed_form": closed_form(campaign, "corrected"),
+        "closed_form_literal": closed_form(campaign, "literal"),
+    })
 
 
 def demonstrate(out: Path, *, seed: int = 7, preset_name: str = "reference",
@@ -327,14 +363,14 @@ def _ratio(value: float | None) -> str:
 
 def _table(result: dict[str, Any], solution: AlignmentSolution) -> str:
     """Errors per quantity and method, the truth in the ellipsoids, the residuals per channel."""
-    heads = ("joint", "starting point", "closed form", "as printed")
+    heads = ("joint", "linear", "closed form", "as printed")
     lines = [f"{result['status']}: {result['why']}", "",
              f"{'error against the truth':<24}{'unit':<8}{'sigma':>9}" + "".join(f"{h:>19}" for h in heads)]
     for q in result["quantities"]:
         cells = "".join(_number(q[key]["error"], 9) + _ratio(q[key]["error_over_sigma"]) for key in METHODS)
         lines.append(f"{q['name']:<24}{q['unit']:<8}{_number(q['cramer_rao_sigma'], 9)}{cells}")
-    lines += ["in brackets: error over sigma, which is the Cramer-Rao bound; starting point: Wahba, momentum, polar "
-              "decomposition;", "closed form: the published formulas, corrected and as printed", "",
+    lines += ["in brackets: error over sigma, which is the Cramer-Rao bound; linear: Wahba, momentum, polar",
+              "decomposition; closed form: the published formulas, corrected and as printed", "",
               f"{'truth in covariance':<24}{'degrees':>8}{'chi2':>9}{'limit (3 sigma)':>19}"]
     for name, block in result["ellipsoids"].items():
         lines.append(f"{name:<24}{block['degrees']:>8}{block['chi2']:>9.2f}{block['limit']:>19.2f}"

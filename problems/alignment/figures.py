@@ -24,13 +24,13 @@ MINUTE = 60.0  # s
 ARCSECOND = np.pi / 648000.0  # rad
 INK, GREY, BAND, LANE = "#1f2933", "#8a94a0", "#e4e9ee", "#f4f6f8"
 COLOURS = ("#0b6e99", "#d9822b", "#5b8c3a")
-METHOD_STYLE = {
+METHOD_STYLE: dict[Any, Any] = {
     "joint": ("#0b6e99", "o"),
-    "starting_point": ("#5b8c3a", "s"),
+    "linear": ("#5b8c3a", "s"),
     "closed_form": ("#d9822b", "D"),
     "closed_form_literal": ("#b3261e", "^"),
 }
-STYLE = {
+STYLE: dict[Any, Any] = {
     "axes.edgecolor": GREY, "axes.labelcolor": INK, "text.color": INK, "xtick.color": INK, "ytick.color": INK,
     "axes.spines.top": False, "axes.spines.right": False, "font.size": 9.5, "axes.titlesize": 10.5,
     "axes.titlelocation": "left", "legend.frameon": False, "figure.dpi": 110,
@@ -62,20 +62,21 @@ def residual_figure(solution: AlignmentSolution) -> Figure:
         for (left, right), row in zip(panels, rows, strict=True):
             place, cuts = _without_gaps(row.time)
             step = max(1, len(place) // DRAWN)
-            order = np.argsort(-np.nanstd(row.residual, axis=0))  # the widest behind
-            for column in order:
+            spreads = np.nanstd(row.residual, axis=0)
+            for column, wide in enumerate(spreads):
                 left.plot(place[::step], row.residual[::step, column], ".", ms=2.2, alpha=0.5, mew=0,
-                          color=COLOURS[column % len(COLOURS)], label=row.labels[column], rasterized=True)
+                          color=COLOURS[column % len(COLOURS)], label=row.labels[column], rasterized=True,
+                          zorder=2.0 - wide / np.max(spreads))  # the widest behind
             for cut in cuts:
                 left.axvline(cut, color=GREY, lw=0.6, ls=":")
-            spread = float(np.nanmax(np.nanstd(row.residual, axis=0)))
+            spread = float(np.max(spreads))
             left.axhline(0.0, color=INK, lw=0.8)
             left.set_ylim(-4.6 * spread, 6.4 * spread)
             left.set_xlim(place[0], place[-1])
             left.set_title(f"{row.title}: measured minus estimated")
             left.set_ylabel(row.unit)
             left.set_xlabel("time, min" + (f" ({len(cuts)} gaps left out, dotted)" if len(cuts) else ""))
-            left.legend(loc="upper right", ncols=len(order), markerscale=5, handletextpad=0.1, columnspacing=0.9,
+            left.legend(loc="upper right", ncols=len(spreads), markerscale=5, handletextpad=0.1, columnspacing=0.9,
                         borderaxespad=0.1)
             flat = row.whitened[np.isfinite(row.whitened)]
             edges = np.linspace(-5, 5, 51)
