@@ -6,6 +6,7 @@ on each station a footprint is an interval, so that the covered length and the o
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,7 +85,7 @@ def scan_line(scan: Scan, time: float, count: int) -> Array:
 
 
 def covered_fraction(outlines: list[Outline], length: float, width: float, stations: int = 801) -> float:
-    """Share of the rectangle ``length`` by ``width`` (m, centred on the plane's origin) inside any of the footprints."""
+    """Share of the rectangle ``length`` by ``width`` (m, about the plane's origin) inside any of the footprints."""
     x = (np.arange(stations) + 0.5) / stations * length - length / 2
     low, high = (np.stack(v) for v in zip(*(o.interval(x) for o in outlines), strict=True))
     low, high = np.clip(low, -width / 2, width / 2), np.clip(high, -width / 2, width / 2)
@@ -122,4 +123,4 @@ def least_overlap(outlines: list[Outline], length: float) -> float | None:
     if len(outlines) < 2:
         return None
     ordered = sorted(outlines, key=lambda o: float(o.lower[:, 1].mean() + o.upper[:, 1].mean()))
-    return float(min(np.min(overlaps(a, b, length)) for a, b in zip(ordered[:-1], ordered[1:], strict=True)))
+    return float(min(np.min(overlaps(a, b, length)) for a, b in itertools.pairwise(ordered)))

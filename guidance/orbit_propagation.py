@@ -16,6 +16,7 @@ import warnings
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -72,7 +73,7 @@ class EarthOrientation:
 
         wanted = (self.epoch - datetime(1858, 11, 17)).total_seconds() / 86400.0
         rows: list[tuple[float, ...]] = []
-        with open(iers.IERS_A_FILE, encoding="ascii") as stream:
+        with Path(iers.IERS_A_FILE).open(encoding="ascii") as stream:
             for line in stream:
                 if not line[58:68].strip():
                     break
@@ -98,7 +99,7 @@ class EarthOrientation:
     def _at_knot(self, index: int) -> tuple[Array, Array, float]:
         """Celestial-to-intermediate matrix, polar motion matrix and Earth rotation angle at a knot."""
         if index not in self._knots:
-            import erfa
+            import erfa  # type: ignore[import-untyped]
             from astropy.time import Time, TimeDelta
 
             with warnings.catch_warnings():
@@ -289,7 +290,7 @@ class Orbit:
         degree = int(min(120, 30 + 60 * (stop - start) / self.period))
         nodes = np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
         values = self.states(0.5 * (start + stop) + 0.5 * (stop - start) * nodes)[:, :3]
-        return Arc(start, stop, chebyshev.chebfit(nodes, values, degree), self.earth)
+        return Arc(start, stop, np.asarray(chebyshev.chebfit(nodes, values, degree), float), self.earth)
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -88,7 +89,8 @@ def _tables(degree: int) -> tuple[Array, Array, Array, Array]:
     weights[0] = 1.0 / (degree + 1)
     analysis = weights[:, None] * chebyshev.chebvander(points, degree).T
     antiderivative = chebyshev.chebint(analysis, lbnd=-1)
-    return (points, analysis, chebyshev.chebvander(points, degree + 1) @ antiderivative, antiderivative.sum(axis=0))
+    integral = np.asarray(chebyshev.chebvander(points, degree + 1) @ antiderivative, float)
+    return points, np.asarray(analysis, float), integral, np.asarray(antiderivative.sum(axis=0), float)
 
 
 class _Polynomial:
@@ -107,7 +109,7 @@ class _Polynomial:
     def value(self, coefficients: Array, at: ArrayLike, order: int = 0) -> Array:
         """Value or derivative at points of the interval; components of the coefficients come last."""
         if order:
-            coefficients = chebyshev.chebder(coefficients, order) / self.half**order
+            coefficients = np.asarray(chebyshev.chebder(coefficients, order), float) / self.half**order
         x = (2 * np.asarray(at, float) - self.low - self.high) / (2 * self.half)
         return chebyshev_values(x, len(coefficients)) @ coefficients
 
@@ -335,17 +337,18 @@ def make_scan(arc: Arc, camera: Camera, line: GroundLine, first: float, last: fl
     if stop <= start or stop > arc.stop or start < arc.start:
         raise GeometryError("the scan leaves the piece of orbit at hand", where="scan",
                             value=f"{start:.1f} to {stop:.1f} s", limit=f"{arc.start:.1f} to {arc.stop:.1f} s")
-    return _with_attitude(arc, camera, line, first, last, start, stop, kind_of_motion, turned, ways, coefficients, turns)
+    return _with_attitude(arc, camera, line, first, last, start, stop, kind_of_motion, turned, ways, coefficients,
+                          turns)
 
 
 def _timed(arc: Arc, camera: Camera, ways: _Polynomial, ground: Array, tangent: Array, start: float, rate: float,
-           sense: float, turned: bool, equalised: bool, visible: object) -> tuple[Array, tuple[_Polynomial, Array] | None]:
+           sense: float, turned: bool, equalised: bool, visible: Callable[[Array], None],
+           ) -> tuple[Array, tuple[_Polynomial, Array] | None]:
     """Times (s) at the nodes of the way, and for the equalised motion the turn about the line of sight over time.
 
     Fixed point: with times given, the satellite's positions, and from them the time that every element of the way
     takes. The slant range changes little while the times move, so that each round gains about two digits.
     """
-    assert callable(visible)
     span = ways.high - ways.low
     from_first = ways.nodes - ways.low if sense > 0 else ways.high - ways.nodes
     times = start + from_first / 7000.0
@@ -450,7 +453,8 @@ def _equalising_turn(arc: Arc, camera: Camera, ways: _Polynomial, coefficients: 
     angle = turned_by(first, np.zeros_like(clock.nodes))
     for _ in range(6):
         middle = cross_motion(angle)
-        high, low = cross_motion(turned_by(first + step, angle + step)), cross_motion(turned_by(first - step, angle - step))
+        high = cross_motion(turned_by(first + step, angle + step))
+        low = cross_motion(turned_by(first - step, angle - step))
         curvature = high - 2 * middle + low
         shift = 0.5 * step * (low - high) / curvature if curvature > 0 else 0.0
         shift = max(-0.3, min(0.3, shift))

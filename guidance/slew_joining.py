@@ -1,7 +1,8 @@
 """The slew between two given motions: a quick estimate of its time for planning, and the slew itself.
 
-The survey planner needs both through one small interface. The slew is the optimal one of :mod:`guidance.slew_optimum`; where
-that finds none, the closed-form polynomial in modified Rodrigues parameters with the least feasible time stands in.
+The survey planner needs both through one small interface. The slew is the optimal one of
+:mod:`guidance.slew_optimum`; where that finds none, the closed-form polynomial in modified Rodrigues parameters with
+the least feasible time stands in.
 """
 
 from __future__ import annotations

@@ -11,7 +11,6 @@ import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from datetime import timedelta
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,6 @@ from guidance.ground_geometry import (
     EQUATORIAL_RADIUS,
     EquidistantPlane,
     GroundLine,
-    geodesic_direct,
     geodesic_inverse,
     wrapped,
 )
@@ -51,7 +49,7 @@ from guidance.survey_planner import (
     excess_of_scans,
     soonest,
 )
-from guidance.survey_request import AreaRequest, LimitsRequest, RouteRequest, SurveyRequest
+from guidance.survey_request import AreaRequest, RouteRequest, SurveyRequest
 from guidance.vector_spline import VectorSpline
 
 Array = NDArray[np.float64]
@@ -245,7 +243,8 @@ class SurveyPlan:
             "least_overlap_percent": 100 * min(overlaps) if overlaps else None,
             "largest_off_nadir_deg": math.degrees(self.off_nadir),
             "area_duration_s": self.area_duration, "duration_s": self.stop - self.start,
-            "largest": {"rate_deg_s": math.degrees(self.largest[0]), "acceleration_deg_s2": math.degrees(self.largest[1]),
+            "largest": {"rate_deg_s": math.degrees(self.largest[0]),
+                        "acceleration_deg_s2": math.degrees(self.largest[1]),
                         "jerk_deg_s3": math.degrees(self.largest[2])},
             "passes": [{"start_s": p.start, "stop_s": p.stop, "scans": len(p.scans)} for p in self.passes],
             "number_of_scans": [{"area": a.request.name, "nadir_swath_km": a.count.nadir_swath / 1e3,
@@ -360,10 +359,12 @@ class Surveyor:
         area = self.request.areas[index]
         limits = self.request.limits
         quarter = 0.5 * math.pi * EQUATORIAL_RADIUS
-        if math.hypot(area.length, area.width) / 2 > quarter:
-            raise InfeasibleError(f"the area {area.name} reaches {math.hypot(area.length, area.width) / 2e3:.0f} km from "
-                                  f"its centre, more than a quarter of the way round the Earth ({quarter / 1e3:.0f} km)",
-                                  limit="size of the area", excess=math.hypot(area.length, area.width) / 2 - quarter)
+        corner = math.hypot(area.length, area.width) / 2
+        if corner > 0.7 * quarter:
+            raise InfeasibleError(
+                f"the area {area.name} is larger than any plan: it reaches {corner / 1e3:.0f} km from its centre, and a "
+                f"plane map serves no farther than ({0.7 * quarter / 1e3:.0f} km), exceeded by "
+                f"{(corner - 0.7 * quarter) / 1e3:.0f} km", limit="size of the area", excess=corner - 0.7 * quarter)
         reach = self.reach() + 0.5 * math.hypot(area.length, area.width)
         plane: EquidistantPlane | None = None
         plans: list[AreaPlan] = []
@@ -384,14 +385,16 @@ class Surveyor:
                 plane = EquidistantPlane(*area.center, azimuth)
             elif abs(float(wrapped(pass_.azimuth - plane.azimuth))) > math.pi / 9:
                 continue
-            tried += 1
-            if tried > 60:
-                break
             self.say(f"{area.name}: pass at {pass_.time:.0f} s, {pass_.distance / 1e3:.0f} km aside")
             shared = next((entry for entry in by_pass if abs(entry[0] - pass_.time) < 1200.0), None)
             arc = shared[1] if shared else self.orbit.arc(pass_.time - HALF_PASS, pass_.time + HALF_PASS)
-            planner = PassPlanner(area, plane, arc, pass_.time, self.camera, limits, self.request.image_rate, self.joiner,
-                                  left)
+            planner = PassPlanner(area, plane, arc, pass_.time, self.camera, limits, self.request.image_rate,
+                                  self.joiner, left)
+            if self._beside(planner, area):
+                continue
+            tried += 1
+            if tried > 40:
+                break
             done = sum(len(p.scans) for p in plans)
             plan, error_ = self._plan_pass(planner, area, done, shared[2][-1][1].stop if shared else None)
             if plan is None:
@@ -413,7 +416,7 @@ class Surveyor:
             left = plan.outlines[-1]
             if len(plans) >= 3 and self._out_of_reach(area, plans):
                 break
-        if not tried and refusal is None:
+        if not tried and refusal is None and plane is None:
             raise self.never_visible(area.name, *area.center, where=f"[[area]] {area.name}")
         if plans:
             edge = float(np.min(plans[-1].outlines[-1].upper[:, 1]))
@@ -421,10 +424,20 @@ class Surveyor:
             raise InfeasibleError(
                 f"the area {area.name} is larger than any plan of {HORIZON / 86400:.0f} days: "
                 f"{sum(len(p.scans) for p in plans)} scans in the {len(plans)} passes of the first "
-                f"{plans[-1].stop / 86400:.1f} days leave {missing / 1e3:.0f} km of its {area.width / 1e3:.0f} km of width "
-                f"uncovered", limit="width of the area", excess=missing)
-        assert refusal is not None
+                f"{plans[-1].stop / 86400:.1f} days leave {missing / 1e3:.0f} km of its {area.width / 1e3:.0f} km of "
+                f"width uncovered", limit="width of the area", excess=missing)
+        if refusal is None:
+            raise InfeasibleError(f"the area {area.name} is larger than any plan: no pass of "
+                                  f"{HORIZON / 86400:.0f} days comes near its left edge", limit="width of the area")
         raise refusal
+
+    def _beside(self, planner: PassPlanner, area: AreaRequest) -> bool:
+        """Whether the first strip to scan lies too far aside of the pass's ground track."""
+        swath = planner.swath(0.0, planner.closest)
+        edge = -area.width / 2 if planner.left is None else float(np.min(planner.left.upper[:, 1]))
+        latitude, longitude = planner.plane.to_ellipsoid(0.0, edge + 0.5 * swath)
+        track = planner.arc.ground_track(np.linspace(planner.arc.start, planner.arc.stop, 181))
+        return float(np.min(geodesic_inverse(latitude, longitude, track[0], track[1])[0])) > self.reach() + swath
 
     def _out_of_reach(self, area: AreaRequest, plans: list[AreaPlan]) -> bool:
         """Whether the progress so far would leave more than half of the rest uncovered at the end of the horizon."""
@@ -447,7 +460,8 @@ class Surveyor:
                     if plan.feasible and (plan.complete or not fill):
                         plan = planner.finish(plan, fill=fill, shift=shift)
                 except (InfeasibleError, GeometryError) as error:
-                    failure = error if isinstance(error, InfeasibleError) else InfeasibleError(str(error))
+                    failure = error if isinstance(error, InfeasibleError) else InfeasibleError(
+                        str(error), limit="off-nadir angle")
                     return None
                 if fill and not plan.complete:
                     return plan
@@ -489,10 +503,10 @@ class Surveyor:
                         plan, count = fewer, count - 1
             elif plan is not None and not plan.complete:
                 gap = half - float(np.min(plan.outlines[-1].upper[:, 1]))
-                failure = InfeasibleError(
-                    f"{area.scans} scans with {100 * area.overlap:g} % overlap leave {2 * gap / 1e3:.1f} km of the area's "
-                    f"{area.width / 1e3:.1f} km of width uncovered; ask for more scans", limit="scans", excess=2 * gap)
-                raise failure
+                raise InfeasibleError(
+                    f"{area.scans} scans with {100 * area.overlap:g} % overlap leave {2 * gap / 1e3:.1f} km of the "
+                    f"area's {area.width / 1e3:.1f} km of width uncovered; ask for more scans", limit="scans",
+                    excess=2 * gap)
             if plan is not None and plan.complete:
                 return plan, failure
         start = min(count - 1, most)
@@ -589,8 +603,8 @@ class Surveyor:
         azimuth = track_azimuth if route.azimuth is None else route.azimuth
         with_flight = abs(float(wrapped(azimuth - track_azimuth))) <= math.pi / 2
         if route.image_motion == "along_track" and not with_flight:
-            raise InfeasibleError(f"the route {route.name} runs against the flight and cannot be scanned along the track",
-                                  limit="azimuth")
+            raise InfeasibleError(f"the route {route.name} runs against the flight and cannot be scanned along the "
+                                  "track", limit="azimuth")
         if with_flight:
             line, last = GroundLine(*route.start, azimuth), route.length
         else:
@@ -690,7 +704,7 @@ class Surveyor:
                 return [join]
         quickest = self.joiner.join(end, head, before.stop)
         if quickest.duration > gap:
-            raise InfeasibleError(f"the slew between two scans takes {quickest.duration:.1f} s and there are {gap:.1f} s",
+            raise InfeasibleError(f"the slew between two scans takes {quickest.duration:.1f} s, there are {gap:.1f} s",
                                   limit="time between scans", excess=quickest.duration - gap)
         hold = _fixed_attitude(arc, head.quaternion, after.start)
         # Leave the hold so that the last slew ends with the next scan's start.
@@ -739,7 +753,8 @@ class Surveyor:
             for piece in planned.pieces:
                 times = np.linspace(piece.start, piece.stop, max(50, int(20 * (piece.stop - piece.start))))
                 motion = piece.motion(times)
-                found = [float(np.max(np.linalg.norm(v, axis=-1))) for v in (motion.rate, motion.acceleration, motion.jerk)]
+                found = [float(np.max(np.linalg.norm(v, axis=-1)))
+                         for v in (motion.rate, motion.acceleration, motion.jerk)]
                 largest = np.maximum(largest, found)
                 off_nadir = max(off_nadir, float(np.max(off_nadir_of_attitude(planned.arc, self.camera, times,
                                                                               motion.quaternion))))
@@ -756,7 +771,8 @@ class Surveyor:
 
 def _fixed_attitude(arc: Arc, quaternion: Array, moment: float) -> Callable[[float, float], Wait]:
     """Waits with the attitude fixed in the orbital frame, equal to ``quaternion`` at ``moment``."""
-    orbital_from_body = arc.orbital_axes(np.array(moment)).T @ Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+    body = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+    orbital_from_body = arc.orbital_axes(np.array(moment)).T @ body
 
     def wait(start: float, stop: float) -> Wait:
         from guidance.scan import _Polynomial

@@ -432,7 +432,7 @@ def counts(width: float, narrowest: float, widest: float, overlap: float) -> Sca
                      2 * width / ((narrowest + widest) * (1 - overlap)))
 
 
-def excess_of_scans(scans: list[Scan], limits: LimitsRequest, off_nadir: float) -> dict[str, tuple[float, float]]:
+def excess_of_scans(scans: Sequence[Scan], limits: LimitsRequest, off_nadir: float) -> dict[str, tuple[float, float]]:
     """Limits that scans exceed: name to (value, limit), SI and rad."""
     found: dict[str, tuple[float, float]] = {}
     for scan in scans:

@@ -32,7 +32,7 @@ azimuths = st.floats(-3.14, 3.14)
 
 
 def test_geodesic_of_flinders_peak_and_buninyong():
-    # Geocentric Datum of Australia technical manual: 54,972.271 m, 306 deg 52' 05.37" and 127 deg 10' 25.07", on GRS 80,
+    # Geocentric Datum of Australia technical manual: 54,972.271 m, 306 deg 52' 05.37", 127 deg 10' 25.07", on GRS 80,
     # whose flattening agrees with WGS 84 to 2e-11.
     def angle(d: float, m: float, s: float) -> float:
         return math.radians(math.copysign(abs(d) + m / 60 + s / 3600, d))

@@ -28,8 +28,9 @@ EPOCH = "2025-03-02T03:04:05Z"
 SOUTHERN = {
     "orbit": {"epoch": EPOCH, "overhead": [-35.0, 179.9], "pass": "descending", "offset_km": 120},
     "area": [{"name": "shelf", "center": [-35.0, 179.9], "length_km": 60, "width_km": 105}],
-    "route": [{"name": "cape", "start": [-31.5, -179.2], "length_km": 30, "when": "before", "image_motion": "equalised"},
-              {"name": "isle", "start": [-37.2, 179.4], "length_km": 40, "when": "after", "image_motion": "along_track"}],
+    "route": [{"name": "cape", "start": [-31.5, -179.2], "length_km": 30, "image_motion": "equalised"},
+              {"name": "isle", "start": [-37.2, 179.4], "length_km": 40, "when": "after",
+               "image_motion": "along_track"}],
 }
 
 
@@ -115,8 +116,8 @@ def test_answer_has_the_agreed_shape(plan):
     answer = json.loads(json.dumps(plan.answer()))
     assert answer["status"] == "ok"
     scan = answer["scans"][0]
-    assert set(scan) >= {"index", "kind", "name", "direction", "image_motion", "start_s", "stop_s", "length_km", "width_km",
-                         "center", "corners"}
+    assert set(scan) >= {"index", "kind", "name", "direction", "image_motion", "start_s", "stop_s", "length_km",
+                         "width_km", "center", "corners"}
     assert [s["name"] for s in answer["scans"]][::len(answer["scans"]) - 1] == ["cape", "isle"]
     assert [s["index"] for s in answer["scans"]] == list(range(1, len(answer["scans"]) + 1))
     assert answer["scans"][0]["length_km"] == pytest.approx(30, abs=1e-9)
@@ -178,7 +179,7 @@ def one_area(orbit=None, limits=None, **area):
 
 
 def test_a_target_beyond_the_ground_track_is_never_visible():
-    with pytest.raises(GeometryError, match="never visible.*limit"):
+    with pytest.raises(GeometryError, match=r"never visible.*limit"):
         plan_survey(survey_request({
             "orbit": {"epoch": EPOCH, "raan_deg": 0, "argument_of_latitude_deg": 0, "inclination_deg": 30},
             "area": [{"center": [60, 10], "length_km": 40, "width_km": 40}]}))
@@ -210,21 +211,21 @@ def test_a_route_that_cannot_be_reached_is_named():
 
 
 def test_an_area_larger_than_the_earth_allows():
-    with pytest.raises(InfeasibleError, match="larger than any plan.*km of width"):
-        plan_survey(one_area(length_km=100, width_km=9000))
+    with pytest.raises(InfeasibleError, match=r"larger than any plan.*km of width"):
+        plan_survey(one_area(length_km=100, width_km=6000))
 
 
 def test_what_one_pass_cannot_do_is_split():
-    # A cone of 21 degrees leaves no room for all the scans in one pass.
+    # A cone of 15 degrees leaves no room for all the scans in one pass.
     plan = plan_survey(survey_request({
         "orbit": {"epoch": EPOCH, "overhead": [60.0, 10.0], "inclination_deg": 98.27},
-        "limits": {"off_nadir_deg": 21},
+        "limits": {"off_nadir_deg": 15},
         "area": [{"center": [60.0, 10.0], "length_km": 70, "width_km": 150}]}))
     answer = plan.answer()
     assert len(plan.passes) > 1
     assert answer["covered_fraction"] >= 0.99
     assert answer["least_overlap_percent"] >= 5.0
-    assert answer["largest_off_nadir_deg"] <= 21.0
+    assert answer["largest_off_nadir_deg"] <= 15.0
     for first, second in zip(plan.passes[:-1], plan.passes[1:], strict=True):
         assert second.start > first.stop
 

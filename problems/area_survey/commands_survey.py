@@ -14,8 +14,8 @@ from problems import console
 def survey(
     request: Annotated[Path, typer.Argument(help="request (TOML)")],
     as_json: Annotated[bool, typer.Option("--json", help="print the answer as JSON")] = False,
-    export: Annotated[Path | None, typer.Option(help="write the attitude as CCSDS AEM, the orbit as OEM beside it")] = None,
-    report: Annotated[Path | None, typer.Option(help="write a report with an interactive globe (one HTML file)")] = None,
+    export: Annotated[Path | None, typer.Option(help="write the attitude (AEM), the orbit as OEM beside it")] = None,
+    report: Annotated[Path | None, typer.Option(help="write a report with a globe (one HTML file)")] = None,
     plots: Annotated[Path | None, typer.Option(help="write the figures into this directory (PNG)")] = None,
     slews: Annotated[str, typer.Option(help="optimal or closed-form")] = "optimal",
 ) -> None:

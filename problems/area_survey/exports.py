@@ -9,6 +9,7 @@ import math
 import os
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +38,8 @@ def attitude_series(plan: SurveyPlan, planned: PlannedPass) -> AttitudeSeries:
 
 def orbit_series(plan: SurveyPlan, planned: PlannedPass) -> OrbitSeries:
     """Orbit around one pass, at whole seconds from the epoch."""
-    times = np.arange(math.floor(planned.start - ORBIT_MARGIN), math.ceil(planned.stop + ORBIT_MARGIN) + 1.0, ORBIT_STEP)
+    first, last = math.floor(planned.start - ORBIT_MARGIN), math.ceil(planned.stop + ORBIT_MARGIN)
+    times = np.arange(first, last + ORBIT_STEP, ORBIT_STEP)
     states = plan.orbit.states(times)
     return OrbitSeries(times, states[:, :3], states[:, 3:], epoch=plan.request.orbit.epoch.isoformat(),
                        reference_frame=INERTIAL_FRAME)
@@ -60,15 +62,13 @@ def save_attitude_and_orbit(plan: SurveyPlan, path: str | os.PathLike[str]) -> l
     if len(attitudes) == 1:
         written += write_attitude(target, attitudes[0], comment=comment)
     elif suffix == ".aem":
-        _segments(target, [lambda p, s=s: write_attitude(p, s, comment=comment)  # type: ignore[misc]
-                           for s in attitudes])
+        _segments(target, [partial(write_attitude, series=s, comment=comment) for s in attitudes])
         written.append(target)
     else:
         for number, series in enumerate(attitudes, 1):
             written += write_attitude(target.with_name(f"{target.stem}-pass-{number}{target.suffix}"), series)
     orbit = target.with_suffix(".oem")
-    _segments(orbit, [lambda p, s=orbit_series(plan, q): write_oem(p, s, comment=FORCE_MODEL)  # type: ignore[misc]
-                      for q in plan.passes])
+    _segments(orbit, [partial(write_oem, series=orbit_series(plan, p), comment=FORCE_MODEL) for p in plan.passes])
     return [*written, orbit]
 
 

@@ -64,7 +64,8 @@ def attitude_figure(plan: SurveyPlan, number: int = 0) -> Any:
     position, velocity = planned.arc.inertial(times)
     orbital = sign_continuous(inertial_from_orbital(position, velocity))
     angles = np.degrees(np.unwrap(angles_312(product(conjugate(orbital), motion.quaternion)), axis=0))
-    sigma = rodrigues_from_quaternion(motion.quaternion * np.sign(motion.quaternion[len(times) // 2, 0]), shortest=False)
+    sign = np.sign(motion.quaternion[len(times) // 2, 0])
+    sigma = rodrigues_from_quaternion(motion.quaternion * sign, shortest=False)
     figure = Figure(figsize=(10.5, 11.0), layout="constrained")
     rows = figure.subplots(4, 1, sharex=True)
     panels = [

@@ -64,7 +64,8 @@ def comparison(plan: SurveyPlan) -> list[tuple[str, str, str, str]]:
     count = plan.areas[0].count
     rows = [
         ("scans of the area", str(len(area)), "5", "5"),
-        ("number of scans, formula as printed", f"{count.printed:.2f}", "2b(1-p/50)/(s0+sm)", "3.98 (p = 5 %), 3.54 (10 %)"),
+        ("number of scans, formula as printed", f"{count.printed:.2f}", "2b(1-p/50)/(s0+sm)",
+         "3.98 (p = 5 %), 3.54 (10 %)"),
         ("number of scans, formula corrected", f"{count.corrected:.2f}", "-", "4.66 (p = 5 %), 4.92 (10 %)"),
         ("directions", "".join("+" if s.forward else "-" for s in area), "odd +, even -", "+-+-+"),
         ("central scan T_c, s", f"{central.duration:.2f}", "-", "29.4"),
@@ -72,7 +73,8 @@ def comparison(plan: SurveyPlan) -> list[tuple[str, str, str, str]]:
         ("slew angles, deg", ", ".join(f"{math.degrees(j.angle):.1f}" for j in joins), "-", "4.4 to 7.3"),
         ("area T_a, s", f"{plan.area_duration:.2f}", "N T_c + (N - 1) T_r", "186.3 at constant T_c; 164.7 at T_c = 26"),
         ("off nadir, deg", f"{math.degrees(plan.off_nadir):.2f}", "at most 40", "35.6"),
-        ("swaths of the area, km", ", ".join(f"{s.width / 1e3:.1f}" for s in area), "-", "42.4 to 53.8 (field 3.33 deg)"),
+        ("swaths of the area, km", ", ".join(f"{s.width / 1e3:.1f}" for s in area), "-",
+         "42.4 to 53.8 (field 3.33 deg)"),
         ("rates in forward / reverse scans, deg/s",
          " ".join(f"{max(_rate(s)):.2f}" for s in area), "-", "0.06 / 0.86 to 1.03"),
     ]

@@ -24,5 +24,6 @@ def save_report(plan: SurveyPlan, path: str | os.PathLike[str]) -> None:
              "<h2>Plan</h2>", tables.html_table(("quantity", "value"), [(a, b) for a, b in tables.summary_rows(plan)]),
              "<h2>Map</h2>", _embedded(map_figure(plan), "Footprints on a map")]
     for number in range(len(plan.passes)):
-        parts += [f"<h2>Attitude, pass {number + 1}</h2>", _embedded(attitude_figure(plan, number), "Attitude over time")]
+        parts += [f"<h2>Attitude, pass {number + 1}</h2>",
+                  _embedded(attitude_figure(plan, number), "Attitude over time")]
     save_globe(plan, path, tables="\n".join(parts))

@@ -14,7 +14,7 @@ COLUMNS = ("scan", "kind", "name", "direction", "image motion", "start, s", "sto
 
 def scan_rows(plan: SurveyPlan) -> list[tuple[str, ...]]:
     """One row of text for each scan, after :data:`COLUMNS`."""
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for s in plan.answer()["scans"]:
         rows.append((str(s["index"]), s["kind"], s["name"], s["direction"], s["image_motion"], f"{s['start_s']:.2f}",
                      f"{s['stop_s']:.2f}", f"{s['length_km']:.2f}", f"{s['width_km']:.2f}", f"{s['area_km2']:.0f}",
@@ -35,7 +35,7 @@ def summary_rows(plan: SurveyPlan) -> list[tuple[str, str]]:
             rows.append((f"{area.request.name}: least overlap",
                          f"{100 * area.overlap:.2f} %, asked {100 * area.request.overlap:g} %"))
         rows.append((f"{area.request.name}: number of scans",
-                     f"{len(area.outlines)} planned; estimate as printed 2b(1-p/50)/(s0+sm) = {area.count.printed:.2f}, "
+                     f"{len(area.outlines)} planned; as printed 2b(1-p/50)/(s0+sm) = {area.count.printed:.2f}, "
                      f"corrected 2b/((s0+sm)(1-p/100)) = {area.count.corrected:.2f}, with swaths "
                      f"{area.count.nadir_swath / 1e3:.1f} and {area.count.widest_swath / 1e3:.1f} km"))
     rows.append(("largest off-nadir angle", f"{math.degrees(plan.off_nadir):.2f} deg, limit "
