@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from guidance.kinematics import Motion, exponential, norm, product
+from guidance.kinematics import Motion, cross, exponential, norm, product
 
 Array = np.ndarray
 
@@ -23,9 +23,9 @@ def magnus_rotation(w: Array, a: Array, j: Array, h: Array) -> Array:
     middle1 = h * (w + a * h / 2 + j * h * h / 8)
     middle2 = h * h * (a + j * h / 2)
     middle3 = h * h * h * j / 2
-    c1 = np.cross(middle1, middle2)
-    c2 = np.cross(middle1, 2 * middle3 - c1) / 60
-    return middle1 + middle3 / 12 + np.cross(20 * middle1 + middle3 + c1, middle2 + c2) / 240
+    c1 = cross(middle1, middle2)
+    c2 = cross(middle1, 2 * middle3 - c1) / 60
+    return middle1 + middle3 / 12 + cross(20 * middle1 + middle3 + c1, middle2 + c2) / 240
 
 
 def running_products(q: Array) -> Array:
@@ -99,7 +99,7 @@ class JerkProfile:
 
     def final(self) -> tuple[Array, Array, Array]:
         """Quaternion, rate and acceleration at the end."""
-        m = self.motion(np.array([self.duration]), longest_step=0.2)
+        m = self.motion(np.array([self.duration]), longest_step=0.5)
         return m.quaternion[0], m.rate[0], m.acceleration[0]
 
     def largest(self) -> tuple[float, float, float]:

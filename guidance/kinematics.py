@@ -45,6 +45,14 @@ def dot(a: Array, b: Array) -> Array:
     return np.sum(a * b, axis=-1, keepdims=True)
 
 
+_NEXT, _AFTER = [1, 2, 0], [2, 0, 1]
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Vector product over the last axis (..., 3): ``numpy.cross`` without its overhead, which dominates small arrays."""
+    return a[..., _NEXT] * b[..., _AFTER] - a[..., _AFTER] * b[..., _NEXT]
+
+
 def norm(a: Array) -> Array:
     """Euclidean length over the last axis, which is dropped."""
     return np.sqrt(np.sum(np.square(a), axis=-1))
@@ -54,7 +62,7 @@ def product(p: ArrayLike, q: ArrayLike) -> Array:
     """Hamilton product ``p o q`` (..., 4); the sign is kept as the factors give it."""
     p, q = np.asarray(p, dtype=float), np.asarray(q, dtype=float)
     p0, pv, q0, qv = p[..., :1], p[..., 1:], q[..., :1], q[..., 1:]
-    return np.concatenate([p0 * q0 - dot(pv, qv), p0 * qv + q0 * pv + np.cross(pv, qv)], axis=-1)
+    return np.concatenate([p0 * q0 - dot(pv, qv), p0 * qv + q0 * pv + cross(pv, qv)], axis=-1)
 
 
 def conjugate(q: ArrayLike) -> Array:
@@ -66,8 +74,8 @@ def rotate(q: ArrayLike, v: ArrayLike) -> Array:
     """Coordinates ``q v q~`` (..., 3): with ``q = x_from_y``, from frame y into frame x."""
     q, v = np.asarray(q, dtype=float), np.asarray(v, dtype=float)
     u = q[..., 1:]
-    t = 2.0 * np.cross(u, v)
-    return v + q[..., :1] * t + np.cross(u, t)
+    t = 2.0 * cross(u, v)
+    return v + q[..., :1] * t + cross(u, t)
 
 
 def exponential(phi: ArrayLike) -> Array:
@@ -134,7 +142,7 @@ def quaternion_derivatives(motion: Motion) -> tuple[Array, Array, Array, Array]:
     square = dot(w, w)
     inner1 = np.concatenate([np.zeros_like(square), w / 2], axis=-1)
     inner2 = np.concatenate([-square / 4, a / 2], axis=-1)
-    inner3 = np.concatenate([-0.75 * dot(w, a), j / 2 + np.cross(w, a) / 4 - square * w / 8], axis=-1)
+    inner3 = np.concatenate([-0.75 * dot(w, a), j / 2 + cross(w, a) / 4 - square * w / 8], axis=-1)
     return q, product(q, inner1), product(q, inner2), product(q, inner3)
 
 
@@ -143,7 +151,7 @@ def motion_from_quaternion_derivatives(q: Array, q1: Array, q2: Array, q3: Array
     inverse = conjugate(q)
     w = 2 * product(inverse, q1)[..., 1:]
     a = 2 * product(inverse, q2)[..., 1:]
-    j = 2 * product(inverse, q3)[..., 1:] - np.cross(w, a) / 2 + dot(w, w) * w / 4
+    j = 2 * product(inverse, q3)[..., 1:] - cross(w, a) / 2 + dot(w, w) * w / 4
     return Motion(q, w, a, j)
 
 
@@ -247,9 +255,9 @@ def rodrigues_derivatives(sigma: ArrayLike, rate: ArrayLike, acceleration: Array
         """Symmetric part in (x, y) of the quadratic part of 4 B."""
         return -dot(x, y) * w + x * dot(y, w) + y * dot(x, w)
 
-    s1 = (w + 2 * np.cross(s, w) + form(s, s, w)) / 4
-    s2 = (a + 2 * np.cross(s1, w) + 2 * np.cross(s, a) + 2 * form(s, s1, w) + form(s, s, a)) / 4
-    s3 = (j + 2 * np.cross(s2, w) + 4 * np.cross(s1, a) + 2 * np.cross(s, j)
+    s1 = (w + 2 * cross(s, w) + form(s, s, w)) / 4
+    s2 = (a + 2 * cross(s1, w) + 2 * cross(s, a) + 2 * form(s, s1, w) + form(s, s, a)) / 4
+    s3 = (j + 2 * cross(s2, w) + 4 * cross(s1, a) + 2 * cross(s, j)
           + 2 * form(s1, s1, w) + 2 * form(s, s2, w) + 4 * form(s, s1, a) + form(s, s, j)) / 4
     return s1, s2, s3
 
@@ -267,11 +275,11 @@ def motion_from_rodrigues(sigma: ArrayLike, sigma1: ArrayLike, sigma2: ArrayLike
     square = dot(s, s)
 
     def inverse(v: Array) -> Array:
-        return 4 * ((1 - square) * v - 2 * np.cross(s, v) + 2 * s * dot(s, v)) / (1 + square) ** 2
+        return 4 * ((1 - square) * v - 2 * cross(s, v) + 2 * s * dot(s, v)) / (1 + square) ** 2
 
     w = inverse(s1)
-    a = inverse(s2 - (2 * np.cross(s1, w) + 2 * form(s, s1, w)) / 4)
-    j = inverse(s3 - (2 * np.cross(s2, w) + 4 * np.cross(s1, a) + 2 * form(s1, s1, w) + 2 * form(s, s2, w)
+    a = inverse(s2 - (2 * cross(s1, w) + 2 * form(s, s1, w)) / 4)
+    j = inverse(s3 - (2 * cross(s2, w) + 4 * cross(s1, a) + 2 * form(s1, s1, w) + 2 * form(s, s2, w)
                       + 4 * form(s, s1, a)) / 4)
     return Motion(quaternion_from_rodrigues(s), w, a, j)
 
@@ -290,9 +298,9 @@ def inertial_from_orbital(position: ArrayLike, velocity: ArrayLike) -> Array:
     """
     r, v = np.asarray(position, dtype=float), np.asarray(velocity, dtype=float)
     y = r / norm(r)[..., None]
-    z = np.cross(v, r)
+    z = cross(v, r)
     z = z / norm(z)[..., None]
-    matrix = np.stack([np.cross(y, z), y, z], axis=-1)
+    matrix = np.stack([cross(y, z), y, z], axis=-1)
     q = Rotation.from_matrix(matrix.reshape(-1, 3, 3)).as_quat(scalar_first=True).reshape((*matrix.shape[:-2], 4))
     return sign_continuous(q) if q.ndim == 2 else q
 

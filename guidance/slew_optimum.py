@@ -44,7 +44,15 @@ _SETTLED = 4e-4  # relative gain of a refinement below which there is no other
 _LAST_PIECE = 1e-3  # of the time to build up the acceleration: length of the piece with the jerk asked for at the stop
 
 
-_QUICK: dict[str, Any] = {"ipopt.mu_init": 1e-3}  # options for a start near the answer
+# The barrier of the interior point stops at 1e-6, not at zero: it costs 2e-5 of the duration, saves a quarter of the
+# iterations, and leaves an answer on the central path, from which a neighbouring one is a few steps away.
+_BARRIER = 1e-6
+_USUAL: dict[str, Any] = {"ipopt.mu_target": _BARRIER}
+_QUICK: dict[str, Any] = {"ipopt.mu_init": 1e-3, "ipopt.mu_target": _BARRIER}  # for a start near the answer
+_WARM: dict[str, Any] = {"ipopt.mu_init": _BARRIER, "ipopt.mu_target": _BARRIER, "ipopt.max_iter": 30,
+                         "ipopt.warm_start_init_point": "yes", "ipopt.warm_start_bound_push": 1e-9,
+                         "ipopt.warm_start_bound_frac": 1e-9, "ipopt.warm_start_slack_bound_push": 1e-9,
+                         "ipopt.warm_start_slack_bound_frac": 1e-9, "ipopt.warm_start_mult_bound_push": 1e-9}
 _BUILDING = [0.0]  # s, all the time this process has spent on making and compiling solvers
 
 
@@ -130,6 +138,11 @@ def _reference(request: SlewRequest, long_way: bool) -> tuple[Array, Array]:
     return product(request.start.quaternion, exponential(phi / 2)), np.tan(half / 4) * axis
 
 
+def _default(name: str) -> dict[str, Any]:
+    """Options of a solver for a start far from the answer."""
+    return _USUAL if name == "ipopt" else {}
+
+
 def _solve(request: SlewRequest, limits: Limits, envelope: Envelope, long_way: bool, fractions: Array, sigma: Array,
            rate: Array, acceleration: Array, duration: float, *, name: str = "ipopt", scales: Scales | None = None,
            margin: Array | float = 0.0, dual: tuple[Array, Array] | None = None, x0: Array | None = None,
@@ -138,7 +151,7 @@ def _solve(request: SlewRequest, limits: Limits, envelope: Envelope, long_way: b
     count = len(fractions)
     begun = time.perf_counter()
     problem = transcription(count, envelope.extras)
-    solver = problem.solver(name, **(options or {}))
+    solver = problem.solver(name, **(_default(name) if options is None else options))
     _BUILDING[0] += time.perf_counter() - begun
     reference, stop = _reference(request, long_way)
     if scales is None:
@@ -201,7 +214,7 @@ def _closed(profile: JerkProfile, request: SlewRequest) -> JerkProfile:
         joints, _, _ = profile.nodes()
         h, total = profile.durations, joints[-1]
         middle = (joints[:-1] + joints[1:]) / 2
-        motion = profile.motion(np.append(middle, total), longest_step=0.2)
+        motion = profile.motion(np.append(middle, total), longest_step=0.5)
         missing = np.concatenate([
             _small_rotation(motion.quaternion[-1], request.stop.quaternion),
             request.stop.rate - motion.rate[-1], request.stop.acceleration - motion.acceleration[-1]])
@@ -356,7 +369,8 @@ def optimal_slew(request: SlewRequest, *, near: Optimum | None = None) -> Optimu
     best_way, total = False, 0
     failures: list[_Attempt] = []
     for long_way in (False, True):
-        if best is not None and lower_bound(inner, limits, long_way=True) >= best.duration:
+        if best is not None and (float(np.linalg.norm(turn(inner, True))) / limits.rate >= best.duration
+                                 or lower_bound(inner, limits, long_way=True) >= best.duration):
             continue
         if long_way and inner.objective == "smoothness" and best is not None:
             continue
@@ -401,9 +415,7 @@ def _replanned(request: SlewRequest, limits: Limits, envelope: Envelope, near: O
     empty = np.zeros((1, 3))
     result = _solve(request, limits, envelope, near.long_way, old.fractions, empty, empty, empty, old.duration,
                     scales=old.scales, x0=old.x.copy(), dual=(old.lam_g, old.lam_x),
-                    options={"ipopt.warm_start_init_point": "yes", "ipopt.mu_init": 1e-6,
-                       "ipopt.warm_start_bound_push": 1e-8, "ipopt.warm_start_slack_bound_push": 1e-8,
-                       "ipopt.warm_start_mult_bound_push": 1e-8, "ipopt.max_iter": 40})
+                    options=_WARM)
     if not result.success:
         return None
     profile = _profile(request, limits, result)
