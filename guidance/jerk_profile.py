@@ -1,4 +1,4 @@
-"""A slew as its jerk: piecewise constant, so that acceleration and rate are polynomials and their extremes are exact."""
+"""A slew as its piecewise constant jerk: acceleration and rate are polynomials, and their extremes are exact."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ _NEXT, _AFTER = [1, 2, 0], [2, 0, 1]
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Vector product over the last axis (..., 3): ``numpy.cross`` without its overhead, which dominates small arrays."""
+    """Vector product over the last axis (..., 3): ``numpy.cross`` without its overhead, which rules small arrays."""
     return a[..., _NEXT] * b[..., _AFTER] - a[..., _AFTER] * b[..., _NEXT]
 
 

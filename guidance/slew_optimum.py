@@ -40,7 +40,7 @@ _NEAR_PROFILE = 0.015  # relative: an optimum this near the eigenaxis profile ha
 _NEARER = 0.004  # and this near where the ends accelerate
 _FINE = 40  # intervals of a refined mesh
 _REFINEMENTS = 3  # at most
-_SETTLED = 4e-4  # relative gain of a refinement below which there is no other
+_SETTLED = 1e-3  # relative gain of a refinement below which there is no other
 _LAST_PIECE = 1e-3  # of the time to build up the acceleration: length of the piece with the jerk asked for at the stop
 
 
@@ -314,7 +314,8 @@ def _one_way(request: SlewRequest, limits: Limits, envelope: Envelope, long_way:
         usual = plain and not difficult
         mesh = switching_mesh(speed, limits, exact=alone) if usual else even_mesh(speed.duration, limits, _FINE)
         first = attempt("from the eigenaxis profile", mesh, *starting_motion(request, axis, speed, mesh), options=quick)
-        if usual and first.success and abs(first.duration / speed.duration - 1) < (_NEARER if pushed > 0.02 else _NEAR_PROFILE):
+        near = _NEARER if pushed > 0.02 else _NEAR_PROFILE
+        if usual and first.success and abs(first.duration / speed.duration - 1) < near:
             return first, spent
     if best is None or not best.success:
         bound = max(lower_bound(request, limits, long_way=long_way), 1e-3)
@@ -454,8 +455,8 @@ def _tightened(request: SlewRequest, limits: Limits, envelope: Envelope, long_wa
 def _too_short(needed: float, duration: float) -> InfeasibleError:
     ratio = needed / duration
     return InfeasibleError(
-        f"the duration {duration:.6g} s is too short: the quickest slew within the limits takes {needed:.6g} s; keeping "
-        f"it needs limits about {ratio:.4g} (rate), {ratio**2:.4g} (acceleration) and {ratio**3:.4g} (jerk) times as "
+        f"the duration {duration:.6g} s is too short: the quickest slew within the limits takes {needed:.6g} s; "
+        f"keeping it needs limits about {ratio:.4g} (rate), {ratio**2:.4g} (acceleration) and {ratio**3:.4g} (jerk) times as "
         "large", limit="duration", excess=needed - duration)
 
 

@@ -362,8 +362,8 @@ class Surveyor:
         corner = math.hypot(area.length, area.width) / 2
         if corner > 0.7 * quarter:
             raise InfeasibleError(
-                f"the area {area.name} is larger than any plan: it reaches {corner / 1e3:.0f} km from its centre, and a "
-                f"plane map serves no farther than ({0.7 * quarter / 1e3:.0f} km), exceeded by "
+                f"the area {area.name} is larger than any plan: it reaches {corner / 1e3:.0f} km from its centre, "
+                f"and a plane map serves no farther than {0.7 * quarter / 1e3:.0f} km, exceeded by "
                 f"{(corner - 0.7 * quarter) / 1e3:.0f} km", limit="size of the area", excess=corner - 0.7 * quarter)
         reach = self.reach() + 0.5 * math.hypot(area.length, area.width)
         plane: EquidistantPlane | None = None

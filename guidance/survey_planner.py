@@ -35,7 +35,7 @@ from guidance.survey_request import AreaRequest, LimitsRequest
 Array = NDArray[np.float64]
 
 AZIMUTH_LIMIT = math.pi / 9  # rad, of the scans from the ground track (Somov et al., section 2)
-OVERLAP_GUARD = 2e-4  # added to the asked overlap
+OVERLAP_GUARD = 1e-3  # added to the asked overlap (a share of the wider scan)
 END_GUARD = 60.0  # m, by which a detector line passes the end of the area
 END_TIME = 0.1  # s of scanning added at each end, so that a file with this step still shows the area covered
 MOST_SCANS = 40  # in one pass

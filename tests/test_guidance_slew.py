@@ -1,4 +1,4 @@
-"""Slews: the closed forms, the optimum against bounds and closed forms, limits between the nodes, infeasible requests."""
+"""Slews: closed forms, the optimum against bounds and closed forms, limits between the nodes, infeasible requests."""
 
 from __future__ import annotations
 
@@ -156,7 +156,11 @@ def test_largest_values_of_a_profile_are_exact() -> None:
         t = np.linspace(0, profile.duration, 4001)
         sampled = kin.norm(profile.motion(t, longest_step=1.0).rate)
         k = int(np.argmax(sampled))
-        inside = minimize_scalar(lambda x, p=profile: -float(kin.norm(p.motion(np.array([x]), longest_step=1.0).rate)[0]),
+
+        def negative(x: float, p: JerkProfile = profile) -> float:
+            return -float(kin.norm(p.motion(np.array([x]), longest_step=1.0).rate)[0])
+
+        inside = minimize_scalar(negative,
                                  bounds=(t[max(k - 1, 0)], t[min(k + 1, 4000)]), method="bounded",
                                  options={"xatol": 1e-10})
         assert profile.largest()[0] == pytest.approx(max(float(sampled.max()), -float(inside.fun)), rel=1e-9)
@@ -335,7 +339,7 @@ def test_start_inside_a_cone_and_weak_actuators_are_named_before_the_solver() ->
     request = random_request(np.random.default_rng(16), angle=60)
     axis = np.array([1.0, 0.0, 0.0])
     cone = KeepOut("Sun", axis, kin.rotate(request.start.quaternion, axis), 0.2)
-    with pytest.raises(InfeasibleError, match="start.*'Sun'.*11.459") as caught:
+    with pytest.raises(InfeasibleError, match=r"start.*'Sun'.*11\.459") as caught:
         optimal_slew(replace(request, keep_out=(cone,)))
     assert caught.value.excess == pytest.approx(0.2, abs=1e-6)
     moving = replace(request, start=replace(request.start, rate=np.array([0.01, 0, 0])))
