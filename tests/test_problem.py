@@ -76,7 +76,7 @@ def test_compressed_trajectory_is_the_joint_problem_with_every_coefficient():
         x = x + np.linalg.lstsq(design, right, rcond=None)[0]
     sigma = np.sqrt(np.diag(estimate.covariance_of("antenna_from_tracker")))
     # The minimum of the whole cost, its place, and the covariance of the angles.
-    assert np.sum(function(x) ** 2) == pytest.approx(sum(p.cost for p in estimate.parts), rel=1e-9)
+    assert np.sum(function(x) ** 2) == pytest.approx(sum(p.cost for p in estimate.parts), rel=1e-8)
     assert np.max(np.abs(x[:3]) / sigma) < 1e-3
     covariance = np.linalg.inv(np.linalg.qr(design, mode="r"))
     np.testing.assert_allclose(estimate.covariance_of("antenna_from_tracker"), covariance[:3] @ covariance[:3].T,
