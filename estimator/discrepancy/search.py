@@ -25,9 +25,10 @@ from estimator.estimate import Estimate
 from estimator.problem import Problem
 from estimator.residuals import Linearization
 from estimator.solvers.gauss_newton import Options, solve
+from estimator.solvers.summary import summarized
 
 SIGNIFICANT = 0.01  # probability of a name where there is nothing, after the search
-SHORTLIST = 5  # candidates that are refitted jointly
+SHORTLIST = 6  # candidates that are refitted jointly
 MOST_EFFECTS = 6
 INDISTINGUISHABLE = 4.6  # log odds (100 to 1) below which two names explain the data equally well
 
@@ -139,7 +140,13 @@ class Workflow:
     # ------------------------------------------------------------------------------------------------ fits
 
     def fit(self, effects: Sequence[str], start: Mapping[str, np.ndarray] | None = None) -> Refit:
-        """The joint fit of the training data with these effects (kept once made)."""
+        """The joint fit of the training data with these effects (kept once made).
+
+        Args:
+            effects: names.
+            start: values of a neighbouring fit; then only the part of the problem that the newcomers touch is solved,
+                the rest being at its optimum already.
+        """
         key = tuple(sorted(effects))
         if key in self._fits:
             return self._fits[key]
@@ -147,8 +154,14 @@ class Workflow:
         if start:
             names = {u.name for u in problem.unknowns}
             known = {n: v for n, v in start.items() if n in names and np.shape(v) == np.shape(problem.start[n])}
+            changed = [u.name for u in problem.unknowns if u.name in key and u.name not in known]
             problem = problem.starting_at(known)
-        estimate = solve(problem, Options(tolerance=1e-3, iterations=60))
+            values = _polished(problem, set(changed or key))
+            prepared = problem.prepared(values)
+            estimate = summarized(prepared, values, prepared.linearize(values), converged=True, reason="",
+                                  iterations=0, solver="gauss-newton", seconds=0.0)
+        else:
+            estimate = solve(problem, Options(tolerance=1e-3, iterations=60))
         cost = float(sum(p.cost for p in estimate.parts))
         plain = self._fits.get(())
         evidence = 0.0 if plain is None else 0.5 * (plain.cost - cost) + self._occam(estimate, key)
@@ -237,16 +250,11 @@ class Workflow:
         """Where the model with these effects and the data disagree."""
         return self.round(effects).gap
 
-    def start_of(self, scores: Sequence[Score], fit: Refit) -> dict[str, np.ndarray]:
-        """Start values of a refit: the accepted fit, and the expected sizes of the newcomers inside their ranges."""
+    def start_of(self, score: Score, fit: Refit) -> dict[str, np.ndarray]:
+        """Start values of a refit: the accepted fit, and for a searched effect the best setting that was tried."""
         start = dict(fit.estimate.values)
-        for score in scores:
-            effect = self.library[score.name]
-            low = np.array([p.plausible[0] for p in effect.parameters])
-            high = np.array([p.plausible[1] for p in effect.parameters])
-            searched = np.array([p.search is not None for p in effect.parameters])
-            size = np.where(np.isfinite(score.sigma) | searched, score.size, score.setting)
-            start[score.name] = np.clip(size, low, high)
+        if any(p.search for p in self.library[score.name].parameters):
+            start[score.name] = score.setting
         return start
 
     # ------------------------------------------------------------------------------------------------ search
@@ -258,14 +266,17 @@ class Workflow:
         significant = [s for s in open_ if after_search(s.p_value, here.looks) < SIGNIFICANT]
         if not significant:
             return None
-        shortlist = significant[:SHORTLIST]
-        by_score = sorted(significant, key=lambda s: s.p_value)[:2]
-        trials = list({s.name: s for s in [*shortlist, *by_score]}.values())
         fitted = []
-        for s in trials:
+        best_gain = -np.inf
+        for s in significant[:SHORTLIST]:
+            if s.evidence < best_gain - 10 * INDISTINGUISHABLE:
+                break  # its linear drop cannot catch up with a joint fit that is made
             self.say(f"refit with {s.name}")
-            refit = self.fit((*effects, s.name), self.start_of([s], here.fit))
-            fitted.append((refit.evidence if self.plausible(s.name, refit) else refit.evidence - 1e3, s, refit))
+            refit = self.fit((*effects, s.name), self.start_of(s, here.fit))
+            sound = self.plausible(s.name, refit)
+            fitted.append((refit.evidence if sound else refit.evidence - 1e9, s, refit))
+            if sound:
+                best_gain = max(best_gain, refit.evidence - here.fit.evidence)
         fitted.sort(key=lambda item: -item[0])
         for _, s, refit in fitted:
             drop = here.fit.cost - refit.cost
@@ -318,7 +329,7 @@ class Workflow:
             for s in [t for t in here.table if t.name not in (*rest, *excluded, name) and t.degrees > 0][:3]:
                 if after_search(s.p_value, here.looks) >= SIGNIFICANT:
                     continue
-                other = self.fit((*rest, s.name), self.start_of([s], here.fit))
+                other = self.fit((*rest, s.name), self.start_of(s, here.fit))
                 if other.evidence > best.evidence + INDISTINGUISHABLE and self.plausible(s.name, other):
                     self.say(f"{s.name} in place of {name}")
                     best = other
@@ -338,7 +349,7 @@ class Workflow:
                 continue
             if s.evidence < mine.evidence - 3 * INDISTINGUISHABLE - 0.05 * mine.score:
                 continue
-            other = self.fit((*rest, s.name), self.start_of([s], here.fit))
+            other = self.fit((*rest, s.name), self.start_of(s, here.fit))
             if other.evidence > reference - INDISTINGUISHABLE and self.plausible(s.name, other):
                 alike.append(s.name)
         return tuple(alike)
@@ -411,6 +422,21 @@ class Workflow:
                 misfit(two.problem, two.parts, held_out=False), misfit(one.problem, one.parts, held_out=True),
                 misfit(two.problem, two.parts, held_out=True), expected, shifts(one, two)))
         return tuple(findings)
+
+
+def _polished(problem: Problem, names: set[str]) -> dict[str, np.ndarray]:
+    """Values with the named unknowns, and all that is connected to them through residuals, at their optimum."""
+    free = {u.name for u in problem.free}
+    reached = names & free
+    growing = True
+    while growing:
+        touched = [r for r in problem.residuals if any(u.name in reached for u in r.unknowns)]
+        grown = reached | {u.name for r in touched for u in r.unknowns if u.name in free}
+        growing = grown != reached
+        reached = grown
+    part = problem.with_residuals(touched).holding(*(free - reached))
+    estimate = solve(part, Options(tolerance=3e-2, iterations=20, largest_step=1e4))
+    return dict(estimate.values)
 
 
 def prior_of(effect: EffectInstance) -> tuple[np.ndarray, np.ndarray]:
