@@ -456,8 +456,8 @@ def _too_short(needed: float, duration: float) -> InfeasibleError:
     ratio = needed / duration
     return InfeasibleError(
         f"the duration {duration:.6g} s is too short: the quickest slew within the limits takes {needed:.6g} s; "
-        f"keeping it needs limits about {ratio:.4g} (rate), {ratio**2:.4g} (acceleration) and {ratio**3:.4g} (jerk) times as "
-        "large", limit="duration", excess=needed - duration)
+        f"keeping it needs limits about {ratio:.4g} (rate), {ratio**2:.4g} (acceleration) and {ratio**3:.4g} (jerk) "
+        "times as large", limit="duration", excess=needed - duration)
 
 
 def _explain_failure(failures: list[_Attempt]) -> NoReturn:
