@@ -38,7 +38,7 @@ class Consistency:
 
     @property
     def deviation(self) -> float:
-        """How many standard deviations ``total`` is away from ``degrees`` (normal approximation, by Wilson-Hilferty)."""
+        """How many standard deviations ``total`` is away from ``degrees`` (normal approximation of Wilson-Hilferty)."""
         if self.degrees <= 0:
             return 0.0
         k = self.degrees

@@ -21,7 +21,7 @@ import numpy as np
 from estimator.losses import Loss, Quadratic
 from estimator.models.compiled import Mapped, compiled
 from estimator.signals import Signal, Values
-from estimator.unknowns import Unknown
+from estimator.unknowns import Manifold, Unknown
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,13 +83,13 @@ class Kernel:
         build: from a dict of input name to SX symbol to the residual (m) as SX.
     """
 
-    def __init__(self, name: str, unknowns: Sequence[Unknown], signals: Sequence[tuple[str, object]],
+    def __init__(self, name: str, unknowns: Sequence[Unknown], signals: Sequence[tuple[str, Manifold]],
                  data: Sequence[tuple[str, int | tuple[int, int]]], noise: Sequence[tuple[str, int]], build: object):
         self.unknowns, self.signals, self.noise = tuple(unknowns), tuple(signals), tuple(noise)
         inputs: dict[str, ca.SX] = {}
         seen: dict[str, ca.SX] = {}
         steps: list[tuple[str, ca.SX]] = []
-        for label, manifold in [*((u.name, u.manifold) for u in unknowns), *signals]:  # type: ignore[misc]
+        for label, manifold in [*((u.name, u.manifold) for u in unknowns), *signals]:
             symbol = ca.SX.sym("x", manifold.ambient)
             step = ca.SX.sym("d", manifold.tangent)
             inputs[label] = symbol

@@ -151,13 +151,13 @@ class Mapped:
                 full = values.reshape(samples, rows, columns)
                 flat = np.ascontiguousarray(full.transpose(0, 2, 1) if columns > 1 else full)
             keep.append(flat)
-            buffer.set_arg(i, memoryview(flat))
+            buffer.set_arg(i, flat.data)
         results = []
         for i in range(self.kernel.n_out()):
             rows, columns = self.kernel.size_out(i)
             out = np.zeros((samples, columns, rows))
             results.append(out)
-            buffer.set_res(i, memoryview(out))
+            buffer.set_res(i, out.data)
         trigger()
         return [r.transpose(0, 2, 1) if r.shape[1] > 1 else r[:, 0, :] for r in results]
 

@@ -45,7 +45,7 @@ def tai_from_utc(texts: Iterable[str]) -> np.ndarray:
     Raises:
         FileFormatError: a text is no date and time.
     """
-    import erfa  # type: ignore[import-untyped]
+    import erfa
 
     whole, seconds, offsets = [], [], []
     known: dict[tuple[int, int, int], float] = {}

@@ -280,7 +280,7 @@ class _Runner:
         self.size, self.state = step.size, step.state
         self.parameters = np.ascontiguousarray(parameters, dtype=float) if step.parameters else np.zeros(1)
         self.buffer, self.trigger = step.step.buffer()
-        self.buffer.set_arg(2, memoryview(self.parameters))
+        self.buffer.set_arg(2, self.parameters.data)
 
     def slope(self, y: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Right side of the equations: what a step of length zero ends with."""
@@ -292,11 +292,11 @@ class _Runner:
         fifth, third = np.empty(self.state), np.empty(self.state)
         columns = np.ascontiguousarray(table.T)
         width = np.array([h])
-        self.buffer.set_arg(0, memoryview(y))
-        self.buffer.set_arg(1, memoryview(k))
-        self.buffer.set_arg(3, memoryview(columns if columns.size else np.zeros(1)))
-        self.buffer.set_arg(4, memoryview(width))
+        self.buffer.set_arg(0, y.data)
+        self.buffer.set_arg(1, k.data)
+        self.buffer.set_arg(3, (columns if columns.size else np.zeros(1)).data)
+        self.buffer.set_arg(4, width.data)
         for i, out in enumerate((after, slope, dense, fifth, third)):
-            self.buffer.set_res(i, memoryview(out))
+            self.buffer.set_res(i, out.data)
         self.trigger()
         return after, slope, dense, fifth, third

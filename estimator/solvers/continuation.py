@@ -3,8 +3,8 @@
 A state carried along a long arc with a wrong inertia tensor or a wrong rate is wrong by whole turns at its end, where
 the cost has many valleys; over the first seconds it has one. So the arcs are first cut to a short horizon, solved
 (directions that so little data leave open do not move), and lengthened step by step from the last answer. If some
-residual still is far above its noise, the inertia tensor is tried from the spherical one, and each quaternion that feeds
-it from turned starts on thinned data; the best is carried on.
+residual still is far above its noise, the inertia tensor is tried from the spherical one, and each quaternion that
+feeds it from turned starts on thinned data; the best is carried on.
 """
 
 from __future__ import annotations
@@ -80,18 +80,17 @@ def _propagated(residual: Residual) -> bool:
 
 def _grown(problem: Problem, values: Mapping[str, np.ndarray], coarse: Options) -> Mapping[str, np.ndarray]:
     """Solve on short horizons first, then on longer ones."""
-    lengths = {}
+    lengths: dict[str, np.ndarray] = {}
     for r in problem.residuals:
-        if _propagated(r):
-            assert isinstance(r, KernelResidual)
+        if isinstance(r, KernelResidual) and _propagated(r):
             lengths[r.name] = r.time - r.time[0]
     if not lengths:
         return values
     longest = max(float(v[-1]) for v in lengths.values())
     horizon = max(float(np.median([v[min(FIRST_SAMPLES, len(v) - 1)] for v in lengths.values()])), 1e-6)
     while horizon < longest:
-        residuals = [r.subset(lengths[r.name] <= horizon) if r.name in lengths else r  # type: ignore[union-attr]
-                     for r in problem.residuals]
+        residuals = [r.subset(lengths[r.name] <= horizon)
+                     if isinstance(r, KernelResidual) and r.name in lengths else r for r in problem.residuals]
         values = solve(problem.with_residuals(residuals).starting_at(values), coarse).values
         horizon *= GROWTH
     return values

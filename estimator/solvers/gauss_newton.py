@@ -93,8 +93,10 @@ def _minimize(problem: Problem, values: Mapping[str, np.ndarray], parts: list[Li
         if size < options.tolerance * 0.1:
             return values, parts, used, ""
         trial = problem.moved(values, step * scales)
-        trial_parts = problem.linearize(trial)
-        trial_equations = normal_equations(problem, trial, trial_parts)
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            # A step may lead where a state diverges; the infinite cost that follows rejects it.
+            trial_parts = problem.linearize(trial)
+            trial_equations = normal_equations(problem, trial, trial_parts)
         used += 1
         actual = equations.cost - trial_equations.cost
         rounding = 1e-13 * abs(equations.cost) * np.sqrt(len(parts) + 1)
@@ -125,7 +127,7 @@ def _damped_step(equations: NormalEquations, damping: float) -> np.ndarray:
         # A direction weaker than the threshold shows as a small pivot; only then is the spectrum worth its price.
         factor = np.linalg.cholesky(matrix)
         inverse_norm = np.linalg.norm(np.linalg.inv(factor), 2)
-        sound = inverse_norm < UNDETERMINED
+        sound = bool(inverse_norm < UNDETERMINED)
     except np.linalg.LinAlgError:
         sound = False
     if sound:

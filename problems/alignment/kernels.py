@@ -91,8 +91,9 @@ def doppler_kernel(beams: int, effects: tuple[EffectInstance, ...]) -> Kernel:
         in_tracker = rotations.rotate(tracker_from_inertial, in_inertial)
         in_antenna = rotations.rotate(x["antenna_from_tracker"], in_tracker)
         predicted = beam_doppler(x["beam_direction"], in_antenna, x["carrier"])
-        for e in _of_channel(mine, "doppler"):
-            predicted += e.function(sample, x[e.name])
+        if sample is not None:
+            for e in _of_channel(mine, "doppler"):
+                predicted += e.function(sample, x[e.name])
         return x["shift"] - predicted
 
     return Kernel(f"doppler_{beams}_{_key(mine)}", (ANTENNA, *(effect_unknown(e) for e in mine)),

@@ -1,4 +1,4 @@
-"""Gross outliers, found without any model of the motion: samples that no smooth curve through their neighbours explains.
+"""Gross outliers, found without a model of the motion: samples that no smooth curve through their neighbours explains.
 
 Each stretch of each channel is fitted by a least-squares spline of degree five with a knot every few samples; the fit
 is iterated with Tukey's biweight, and a sample further from it than ``THRESHOLD`` standard deviations (the declared
@@ -108,7 +108,8 @@ def continuous_signs(quaternion: np.ndarray) -> np.ndarray:
 def screen(campaign: Campaign) -> Screening:
     """Find the gross outliers of a campaign."""
     gnss, tracker, doppler = campaign.gnss, campaign.star_tracker, campaign.doppler
-    keep_gnss = ~smooth_outliers(gnss.time, gnss.position, np.broadcast_to(gnss.standard_deviation, gnss.position.shape))
+    accuracy = np.broadcast_to(gnss.standard_deviation, gnss.position.shape)
+    keep_gnss = ~smooth_outliers(gnss.time, gnss.position, accuracy)
     # A small rotation phi changes the quaternion by phi/2, whatever its axis; the noisiest axis sets the scale.
     sigma = 0.5 * np.max(np.broadcast_to(tracker.standard_deviation, (len(tracker.time), 3)), axis=1)
     keep_tracker = ~smooth_outliers(tracker.time, continuous_signs(tracker.quaternion), np.tile(sigma[:, None], (1, 4)))
