@@ -99,7 +99,7 @@ class EarthOrientation:
     def _at_knot(self, index: int) -> tuple[Array, Array, float]:
         """Celestial-to-intermediate matrix, polar motion matrix and Earth rotation angle at a knot."""
         if index not in self._knots:
-            import erfa  # type: ignore[import-untyped]
+            import erfa
             from astropy.time import Time, TimeDelta
 
             with warnings.catch_warnings():

@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -178,7 +178,6 @@ class SurveyPlan:
     areas: tuple[PlannedArea, ...]
     off_nadir: float
     largest: tuple[float, float, float]
-    notes: tuple[str, ...] = field(default=())
 
     @property
     def scans(self) -> list[PlannedScan]:
@@ -211,7 +210,19 @@ class SurveyPlan:
         slews = self.joins
         text = (f"{len(self.scans)} scans and {len(slews)} slews in {len(self.passes)} pass"
                 f"{'es' if len(self.passes) > 1 else ''}, all limits hold")
-        return "; ".join([text, *self.notes])
+        return "; ".join([text, *self.shortfalls()])
+
+    def shortfalls(self) -> list[str]:
+        """What the areas lack: less than 99 % covered, or less overlap than asked (nothing, for a good plan)."""
+        found = []
+        for area in self.areas:
+            name = area.request.name
+            if area.covered < 0.99:
+                found.append(f"{name} is covered to {100 * area.covered:.2f} %, wanted 99 %")
+            if area.overlap is not None and area.overlap < area.request.overlap - 1e-6:
+                found.append(f"{name} has a least overlap of {100 * area.overlap:.2f} %, asked "
+                             f"{100 * area.request.overlap:g} %")
+        return found
 
     def answer(self) -> dict[str, Any]:
         """The machine-readable answer; times in s from the epoch, angles in degrees, lengths in km."""
@@ -234,7 +245,8 @@ class SurveyPlan:
                 "pass": next(i for i, p in enumerate(self.passes, 1) if planned in p.scans),
             })
         return {
-            "status": "ok", "why": self.why(), "epoch": self.request.orbit.epoch.isoformat() + "Z", "scans": scans,
+            "status": "not_converged" if self.shortfalls() else "ok", "why": self.why(),
+            "epoch": self.request.orbit.epoch.isoformat() + "Z", "scans": scans,
             "slews": [{"start_s": j.start, "duration_s": j.duration, "angle_deg": math.degrees(j.angle), "law": j.law}
                       for j in self.joins],
             "waits": [{"start_s": w.start, "duration_s": w.duration}
@@ -280,7 +292,6 @@ class Surveyor:
         limits = request.limits
         self.joiner = Joiner(Limits(limits.rate, limits.acceleration, limits.jerk), optimal=optimal)
         self.say = progress or (lambda _: None)
-        self.notes: list[str] = []
 
     # ----------------------------------------------------------------------------------------------------- passes
 
@@ -766,7 +777,7 @@ class Surveyor:
         if off_nadir > limits.off_nadir + 1e-9:
             raise infeasible({"off-nadir angle": (off_nadir, limits.off_nadir)}, "the plan", len(passes))
         return SurveyPlan(self.request, self.orbit, self.camera, tuple(passes), areas, off_nadir,
-                          (float(largest[0]), float(largest[1]), float(largest[2])), tuple(self.notes))
+                          (float(largest[0]), float(largest[1]), float(largest[2])))
 
 
 def _fixed_attitude(arc: Arc, quaternion: Array, moment: float) -> Callable[[float, float], Wait]:

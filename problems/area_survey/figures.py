@@ -281,7 +281,7 @@ def globe(plan: SurveyPlan, *, frames: int = 160) -> Any:
                "camera": {"eye": dict(zip("xyz", (float(v) for v in eye), strict=True)),
                           "center": dict(zip("xyz", (float(v) for v in target), strict=True)),
                           "up": {"x": 0, "y": 0, "z": 1}}},
-        margin={"l": 0, "r": 0, "t": 46, "b": 0}, legend={"x": 0.01, "y": 0.98, "bgcolor": "rgba(255,255,255,0.7)"},
+        margin={"l": 0, "r": 0, "t": 46, "b": 30}, legend={"x": 0.01, "y": 0.98, "bgcolor": "rgba(255,255,255,0.7)"},
         updatemenus=[{"type": "buttons", "x": 0.02, "y": 0.06, "direction": "left", "showactive": False, "buttons": [
             {"label": "play", "method": "animate",
              "args": [None, {"frame": {"duration": 60, "redraw": True}, "fromcurrent": True,
@@ -304,7 +304,8 @@ def save_globe(plan: SurveyPlan, path: str | os.PathLike[str], *, tables: str = 
     """
     figure = globe(plan)
     figure.update_layout(height=760)
-    body = figure.to_html(full_html=False, include_plotlyjs=True, config={"displaylogo": False, "responsive": True})
+    body = figure.to_html(full_html=False, include_plotlyjs=True, auto_play=False,
+                          config={"displaylogo": False, "responsive": True})
     page = f"""<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><title>Survey plan</title>
 <link rel="icon" href="data:,">

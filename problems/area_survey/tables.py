@@ -56,13 +56,16 @@ def text(plan: SurveyPlan) -> Any:
     from rich.console import Group
     from rich.table import Table
 
-    scans = Table(*COLUMNS, box=None, header_style="bold")
+    scans = Table("scan", "name", "direction", "start, s", "stop, s", "km", "x km", "off nadir", box=None,
+                  header_style="bold")
+    places = Table("scan", "image motion", "area, km2", "centre lat, lon, deg", box=None, header_style="bold")
     for row in scan_rows(plan):
-        scans.add_row(*row)
+        scans.add_row(row[0], row[2], row[3], *row[5:9], row[10])
+        places.add_row(row[0], row[4], row[9], row[11])
     whole = Table("", "", box=None, show_header=False)
     for name, value in summary_rows(plan):
         whole.add_row(name, value)
-    return Group(plan.why(), "", scans, "", whole)
+    return Group(plan.why(), "", scans, "", places, "", whole)
 
 
 def html_table(columns: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
