@@ -496,8 +496,8 @@ def _scores_section(explanation: Explanation) -> str:
             ("power", True), ("expected size", False)]
     parts = ['<h2 id="scores">Every candidate at the plain model</h2>',
              "<p>Score: drop of the sum of squares that the effect would bring, the calibration refitted with it. "
-             "Power: probability to see it here if it had its typical size. The search over the whole library amounts to "
-             f"{findings.looks:.0f} independent looks.</p>", _table(head, rows[:10])]
+             "Power: probability to see it here if it had its typical size. The search over the whole library amounts "
+             f"to {findings.looks:.0f} independent looks.</p>", _table(head, rows[:10])]
     if len(rows) > 10:
         parts.append(f"<details><summary>{len(rows) - 10} more candidates</summary>{_table(head, rows[10:])}</details>")
     hidden = [s for s in table if s.degrees == 0 or s.absorbed_by]
@@ -525,8 +525,8 @@ def _imitation_section(explanation: Explanation) -> str:
         parts.append("<p>Fewer than two candidates are significant, so nothing can be mistaken for another.</p>")
         return "".join(parts)
     parts.append(f"<figure>{imitation_figure(names, matrix)}<figcaption>If the effect of the row were true, how much "
-                 "of its signature the effect of the column would copy, the calibration refitted with it: 1 is a perfect "
-                 "copy, which no data of this kind can tell apart.</figcaption></figure>")
+                 "of its signature the effect of the column would copy, the calibration refitted with it: 1 is a "
+                 "perfect copy, which no data of this kind can tell apart.</figcaption></figure>")
     return "".join(parts)
 
 
@@ -545,12 +545,12 @@ def _next_section(explanation: Explanation) -> str:
 
 def _reading_section(explanation: Explanation) -> str:
     return f"""<h2 id="reading">How to read this page</h2>
-<p class="small">The last {100 * explanation.subject.hold_out:.0f} % of every arc and short blocks of the positions were
-kept from all fits that decide what is named; they are the held-out data. An effect is added only if it is significant
-after the search over the whole library (probability below 1 %) and predicts the held-out data better. Names that explain
-the data about equally well form a group. The parameters come from one joint fit of all data, together with the mounting,
-the inertia, the actuators and the trajectory; their sigmas are those of that fit. "Unknown" means that structure is left
-that no effect of the library explains. The search took {explanation.seconds:.0f} s.</p>"""
+<p class="small">The last {100 * explanation.subject.hold_out:.0f} % of every arc and short blocks of the positions
+were kept from all fits that decide what is named; they are the held-out data. An effect is added only if it is
+significant after the search over the whole library (probability below 1 %) and predicts the held-out data better. Names
+that explain the data about equally well form a group. The parameters come from one joint fit of all data, together with
+the mounting, the inertia, the actuators and the trajectory; their sigmas are those of that fit. "Unknown" means that
+structure is left that no effect of the library explains. The search took {explanation.seconds:.0f} s.</p>"""
 
 
 def write_report(explanation: Explanation, path: Path, *, source: str = "") -> None:
