@@ -2,8 +2,8 @@
 
 Under the accepted model the projected gradients of all candidates, all settings of searched parameters included, are
 jointly Gaussian with a covariance that is known from their signatures. Drawing them simulates the whole search without
-simulating data: the distribution of the smallest p-value over the library gives the number of independent looks that the
-search amounts to, and from it the probability of a name where there is nothing.
+simulating data: the distribution of the smallest p-value over the library gives the number of independent looks that
+the search amounts to, and from it the probability of a name where there is nothing.
 """
 
 from __future__ import annotations

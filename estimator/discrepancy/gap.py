@@ -200,7 +200,8 @@ def _place(channel: str, unit: str, cells: list[_Cell], everything: list[_Cell],
     where = "every arc" if set(arcs) == all_arcs else "arcs " + ", ".join(arcs)
     shape = "constant within an arc" if dominant == 0 else f"changes within {scale:.3g} s"
     value, noise, shown = _readable(excess, floor, unit)
-    sentence = f"{channel.replace('_', ' ')}, {parts}, {where}: {value:.3g} {shown} RMS over {noise:.3g} {shown}; {shape}"
+    size = f"{value:.3g} {shown} RMS over {noise:.3g} {shown}"
+    sentence = f"{channel.replace('_', ' ')}, {parts}, {where}: {size}; {shape}"
     return Place(channel, arcs, components, scale, unit, excess, floor, p, sentence)
 
 

@@ -197,8 +197,8 @@ def scored(stacked: Stack, candidate: Signature, projected: np.ndarray | None = 
     eigenvalues, vectors = np.linalg.eigh(relative)
     visible = (eigenvalues > INVISIBLE) & (eigenvalues > 0)
     # A direction whose whole signature at a typical size stays below a hundredth of a sigma carries nothing either.
-    strength = np.array([float((v / size_raw) @ matrix @ (v / size_raw)) / max(float(np.sum((v / size_raw) ** 2)), 1e-300)
-                         for v in vectors.T])
+    unit = (vectors / size_raw[:, None]).T
+    strength = np.einsum("ki,ij,kj->k", unit, matrix, unit) / np.maximum(np.sum(unit**2, axis=1), 1e-300)
     visible &= strength > 1e-4
     degrees = int(visible.sum())
     size = np.array(candidate.setting, dtype=float)
@@ -217,6 +217,7 @@ def scored(stacked: Stack, candidate: Signature, projected: np.ndarray | None = 
     sigma[candidate.ordinary] = np.where(exposed, spread, np.inf)
     share = float(np.trace(matrix) / max(np.trace(raw), 1e-300))
     evidence = log_evidence(candidate.effect, candidate.ordinary, matrix, -gradient)
+    evidence -= float(np.log(len(settings(candidate.effect))))  # the best of so many settings is taken
     typical = float(np.trace(matrix)) / len(scales)
     power = float(1 - _noncentral(chi2.ppf(0.99, degrees), degrees, typical))
     return Score(candidate.effect.name, candidate.setting, score, degrees, float(chi2.sf(score, degrees)), size, sigma,
@@ -268,14 +269,28 @@ def _absorbers(stacked: Stack, columns: np.ndarray) -> tuple[str, ...]:
 
 
 def settings(effect: EffectInstance) -> list[np.ndarray]:
-    """Start values to try: one for an ordinary effect, the grid of the searched parameters else."""
-    grids = []
-    for p in effect.parameters:
+    """Start values to try: one for an ordinary effect, the grid of the first searched parameter else.
+
+    Further searched parameters (a mode's damping beside its frequency) shape a signature far less; they stay at the
+    middle of their range until the refit.
+    """
+    grid: list[np.ndarray] = []
+    first = True
+    start = np.zeros(len(effect.parameters))
+    values = np.zeros(1)
+    index = None
+    for i, p in enumerate(effect.parameters):
         if p.search is None:
-            grids.append([0.0])
-        else:
-            low, high, number, kind = p.search
+            continue
+        low, high, number, kind = p.search
+        if first:
             values = np.geomspace(low, high, number) if kind == "logarithmic" else np.linspace(low, high, number)
-            grids.append(list(values))
-    mesh = np.meshgrid(*grids, indexing="ij")
-    return [np.array(v) for v in zip(*(m.ravel() for m in mesh), strict=True)]
+            index, first = i, False
+        else:
+            start[i] = np.sqrt(low * high) if kind == "logarithmic" else 0.5 * (low + high)
+    for value in values:
+        setting = start.copy()
+        if index is not None:
+            setting[index] = value
+        grid.append(setting)
+    return grid

@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from scipy.stats import chi2
@@ -176,15 +177,17 @@ class Workflow:
             effect = self.library[name]
             if all(u.name != name for u in estimate.unknowns):
                 continue
-            covariance = estimate.covariance_of(name)
-            values = np.asarray(estimate.values[name])
+            ordinary = [i for i, p in enumerate(effect.parameters) if p.search is None]
             width, centre = prior_of(effect)
-            scaled = covariance / np.outer(width, width)
-            eigenvalues = np.linalg.eigvalsh(0.5 * (scaled + scaled.T))
-            # Posterior of a linear parameter with prior 1: volume ratio sqrt(c/(1 + c)).
-            total += 0.5 * float(np.sum(np.log(np.maximum(eigenvalues, 1e-30) / (1 + np.maximum(eigenvalues, 0)))))
-            deviation = (values - centre) / width
-            total -= 0.5 * float(deviation @ np.linalg.solve(np.eye(len(width)) + scaled, deviation))
+            scaled = (estimate.covariance_of(name) / np.outer(width, width))[np.ix_(ordinary, ordinary)]
+            values = ((np.asarray(estimate.values[name]) - centre) / width)[ordinary]
+            # Directions that the data leave open have no posterior narrower than the prior and cost nothing.
+            eigenvalues, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))
+            seen = eigenvalues > 1e-20
+            total += 0.5 * float(np.sum(np.log(eigenvalues[seen] / (1 + eigenvalues[seen]))))
+            along = vectors[:, seen].T @ values
+            total -= 0.5 * float(np.sum(along**2 / (1 + eigenvalues[seen])))
+            total -= float(np.log(len(settings(effect))))  # the best of so many settings was taken
         return total
 
     # ------------------------------------------------------------------------------------------------ scores
@@ -207,7 +210,7 @@ class Workflow:
         signatures += [on_rows(s, stacked) for s in self.searched_signatures() if s.effect.name not in key]
         widths = np.cumsum([0, *(s.columns.shape[1] for s in signatures)])
         together = stacked.projected(np.concatenate([s.columns for s in signatures], axis=1))
-        projected = [together[:, a:b] for a, b in zip(widths[:-1], widths[1:], strict=True)]
+        projected = [together[:, a:b] for a, b in pairwise(widths)]
         scores = [scored(stacked, s, p) for s, p in zip(signatures, projected, strict=True)]
         if self._looks is None:
             self.say("rate of false alarms")
@@ -326,9 +329,11 @@ class Workflow:
         for name in effects:
             rest = tuple(n for n in effects if n != name)
             here = self.round(rest)
+            mine = next((s for s in here.table if s.name == name), None)
             for s in [t for t in here.table if t.name not in (*rest, *excluded, name) and t.degrees > 0][:3]:
-                if after_search(s.p_value, here.looks) >= SIGNIFICANT:
+                if after_search(s.p_value, here.looks) >= SIGNIFICANT or (mine and _hopeless(s, mine)):
                     continue
+                self.say(f"{s.name} in place of {name}?")
                 other = self.fit((*rest, s.name), self.start_of(s, here.fit))
                 if other.evidence > best.evidence + INDISTINGUISHABLE and self.plausible(s.name, other):
                     self.say(f"{s.name} in place of {name}")
@@ -347,8 +352,9 @@ class Workflow:
         for s in here.table:
             if s.name == name or s.degrees == 0 or s.score < 0.5 * mine.score - 20:
                 continue
-            if s.evidence < mine.evidence - 3 * INDISTINGUISHABLE - 0.05 * mine.score:
+            if _hopeless(s, mine):
                 continue
+            self.say(f"{s.name} beside {name}?")
             other = self.fit((*rest, s.name), self.start_of(s, here.fit))
             if other.evidence > reference - INDISTINGUISHABLE and self.plausible(s.name, other):
                 alike.append(s.name)
@@ -424,6 +430,11 @@ class Workflow:
         return tuple(findings)
 
 
+def _hopeless(candidate: Score, reference: Score) -> bool:
+    """Whether a joint refit cannot be expected to lift ``candidate`` to ``reference``; big gaps get more benefit."""
+    return candidate.evidence < reference.evidence - 3 * INDISTINGUISHABLE - 0.05 * reference.score
+
+
 def _polished(problem: Problem, names: set[str]) -> dict[str, np.ndarray]:
     """Values with the named unknowns, and all that is connected to them through residuals, at their optimum."""
     free = {u.name for u in problem.free}
@@ -435,7 +446,7 @@ def _polished(problem: Problem, names: set[str]) -> dict[str, np.ndarray]:
         growing = grown != reached
         reached = grown
     part = problem.with_residuals(touched).holding(*(free - reached))
-    estimate = solve(part, Options(tolerance=3e-2, iterations=20, largest_step=1e4))
+    estimate = solve(part, Options(tolerance=3e-2, iterations=12, largest_step=1e4))
     return dict(estimate.values)
 
 

@@ -10,7 +10,7 @@ from estimator.consistency import consistency
 from estimator.estimate import Estimate, ResidualSummary, Status
 from estimator.observability import weak_directions
 from estimator.problem import Problem, normal_equations
-from estimator.residuals import Linearization
+from estimator.residuals import Linearization, Residual
 from estimator.unknowns import offsets
 
 GAP_LEVEL = 1 - 6.3e-5
@@ -47,7 +47,7 @@ def summarized(problem: Problem, values: Mapping[str, np.ndarray], parts: Sequen
         worst = sorted(gaps, key=lambda s: -s.consistency.ratio)
         named = ", ".join(f"{s.name} (chi2 per degree of freedom {s.consistency.ratio:.4g})" for s in worst[:6])
         sentences.append(f"the model does not explain the data in {named}")
-    asked = [w for w in weak if any(not _by_name(problem, n).nuisance for n in w.participation)]
+    asked = [w for w in weak if any(not problem.unknown(n).nuisance for n in w.participation)]
     if asked:
         status = max(status, Status.UNOBSERVABLE, key=lambda s: s.gravity)
         sentences.append("the data do not determine " + "; ".join(w.sentence for w in asked))
@@ -55,10 +55,6 @@ def summarized(problem: Problem, values: Mapping[str, np.ndarray], parts: Sequen
         sentences.append(f"converged in {iterations} iterations; every residual agrees with its declared noise")
     return Estimate(problem, dict(values), covariance, tuple(weak), parts, summaries, status, ". ".join(sentences),
                     iterations, solver, seconds)
-
-
-def _by_name(problem: Problem, name: str):  # type: ignore[no-untyped-def]
-    return problem.unknown(name)
 
 
 def _pseudo_inverse(matrix: np.ndarray, dropped: int) -> np.ndarray:
@@ -70,7 +66,7 @@ def _pseudo_inverse(matrix: np.ndarray, dropped: int) -> np.ndarray:
     return (kept / eigenvalues[dropped:]) @ kept.T
 
 
-def _summary(residual, part: Linearization, covariance: np.ndarray, problem: Problem) -> ResidualSummary:  # type: ignore[no-untyped-def]
+def _summary(residual: Residual, part: Linearization, covariance: np.ndarray, problem: Problem) -> ResidualSummary:
     columns = offsets(problem.free)
     picks, places, position = [], [], 0
     for u in part.columns:
@@ -83,7 +79,7 @@ def _summary(residual, part: Linearization, covariance: np.ndarray, problem: Pro
     if picks:
         pick, place = np.concatenate(picks), np.concatenate(places)
         rows = part.jacobian[:, :, pick] * np.sqrt(part.weight)[:, None, None]
-        flat = rows.reshape(-1, len(pick))
+        flat = rows.reshape(rows.shape[0] * rows.shape[1], len(pick))
         used = float(np.sum((flat.T @ flat) * covariance[np.ix_(place, place)]))
     total = float(np.sum(part.weight[:, None] * part.whitened**2))
     kept = part.weight > 0
