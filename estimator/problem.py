@@ -161,6 +161,8 @@ def normal_equations(problem: Problem, values: Mapping[str, np.ndarray], parts: 
         if not picks:
             continue
         pick, place = np.concatenate(picks), np.concatenate(index)
+        if not len(pick):
+            continue  # nothing else feels the trajectory: the positions have no columns
         root = np.sqrt(part.weight)[:, None]
         rows = (part.jacobian[:, :, pick] * root[:, :, None]).reshape(-1, len(pick)) * scales[place]
         right = (part.whitened * root).reshape(-1)
