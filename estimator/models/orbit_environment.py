@@ -83,7 +83,9 @@ def installed_orientation(first: float, last: float) -> EarthOrientation:
         values = np.asarray(table[name].value, dtype=float)[chosen] * scale
         return np.where(np.isfinite(values), values, 0.0)
 
-    unit = 1e-3 if "mas" in str(table["dX_2000A"].unit) else 1.0
+    import astropy.units as u
+
+    unit = float(table["dX_2000A"].unit.to(u.arcsec))
     return EarthOrientation(date, column("UT1_UTC", 1.0) - tai_minus_utc(date), column("PM_x", _ARC_SECOND),
                             column("PM_y", _ARC_SECOND), column("dX_2000A", unit * _ARC_SECOND),
                             column("dY_2000A", unit * _ARC_SECOND), "installed IERS bulletin A")

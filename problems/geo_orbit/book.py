@@ -119,7 +119,7 @@ class BookCase:
         return float(self.first_state[1] - self.station[0] - np.radians(20.0))
 
 
-def _measurement(x: Matrix, greenwich: Matrix) -> Matrix:
+def measurement(x: Matrix, greenwich: Matrix) -> Matrix:
     """The four measurements (4) at reception, the same functions as the batch's kernels."""
     state = cartesian_from_spherical(x[:6])
     earth = Earth(ca.DM.eye(3), greenwich, ca.DM.eye(3))
@@ -148,7 +148,7 @@ def _kernels() -> tuple[Mapped, Mapped]:
     move = compiled(ca.Function("book_move", [x, nominal, on, t, factor], [after, ca.densify(ca.jacobian(after, x))],
                                 ["x", "n", "o", "t", "f"], ["y", "phi"]))
     angle = ca.SX.sym("s")
-    seen = _measurement(x, angle)
+    seen = measurement(x, angle)
     look = compiled(ca.Function("book_look", [x, angle], [seen, ca.densify(ca.jacobian(seen, x))], ["x", "s"], ["z", "h"]))
     return Mapped(move, ("n", "o", "t", "f")), Mapped(look, ("s",))
 
