@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from estimator.models.errors import BoresightError, InfeasibleError
@@ -77,11 +78,11 @@ def run(work: Callable[[], tuple[dict[str, Any], Callable[[], object]]], *, as_j
         result, text = work()
     except InfeasibleError as error:
         why = str(error)
-        answer({"status": "infeasible", "why": why}, as_json=as_json, text=lambda: f"infeasible: {why}")
+        answer({"status": "infeasible", "why": why}, as_json=as_json, text=lambda: escape(f"infeasible: {why}"))
         return
     except BoresightError as error:
         why = str(error)
-        words.print(f"[red]bad input[/red]: {why}", highlight=False)
+        words.print(f"[red]bad input[/red]: {escape(why)}", highlight=False)
         answer({"status": "bad_input", "why": why}, as_json=as_json, text=lambda: "")
         return
     answer(result, as_json=as_json, text=text)
