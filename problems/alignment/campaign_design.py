@@ -1,0 +1,182 @@
+"""Which measurements to make: criteria on an information matrix, and the best share of time for each candidate.
+
+The joint problem's information matrix is a sum over what is measured, so a campaign can be judged before it is flown.
+Three criteria, all to be made small, on the covariance ``C = (information)^-1`` of the unknowns in question:
+
+    A   trace of C                 mean square error
+    D   log det C                  volume of the error ellipsoid, whatever the units
+    E   largest eigenvalue of C    error of the worst direction
+
+They are pure CasADi functions here, so that a smooth design (an attitude profile) goes to IPOPT. For designs that are a
+choice among candidates (arcs), :func:`best_shares` finds the shares of the total time, a convex problem, with a bound
+that no other choice among the same candidates can beat (the equivalence theorem of Kiefer and Wolfowitz, 1960).
+
+``E`` is not smooth where two eigenvalues meet: the optimisers use ``(trace C^p)^(1/p)``, which is above the largest
+eigenvalue by at most the factor ``n^(1/p)``; values that are reported are exact.
+
+Sessions of Doppler measurements are designed in :mod:`problems.alignment.campaign_design_session`, free rotations and
+torque pulses in :mod:`problems.alignment.campaign_design_rotation`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import casadi as ca
+import numpy as np
+
+from estimator.models.errors import RequestError, ShapeError
+from estimator.models.rotations import Matrix
+
+Criterion = Literal["A", "D", "E"]
+EXPONENT = 16  # of the smooth stand-in for the largest eigenvalue, a power of two
+SINGULAR = 1e-12  # smallest over largest eigenvalue of an information matrix that counts as invertible
+MEANING = {"A": "trace of the covariance", "D": "log determinant of the covariance",
+           "E": "largest eigenvalue of the covariance"}
+
+
+def checked_criterion(name: str) -> Criterion:
+    """``name`` as a criterion, in capitals.
+
+    Raises:
+        RequestError: it is none.
+    """
+    for known in get_args(Criterion):
+        if name.upper() == known:
+            return known  # type: ignore[no-any-return]
+    raise RequestError(f"no criterion is named {name!r}", where="criterion", limit="A, D or E",
+                       remedy="; ".join(f"{k}: {v}" for k, v in MEANING.items()))
+
+
+def smooth_criterion(criterion: Criterion, information: Matrix, exponent: int = EXPONENT) -> Matrix:
+    """Logarithm of A, D itself, or the logarithm of the smooth stand-in for E, of an information matrix (n x n).
+
+    A CasADi expression; logarithms make the value independent of the unit of the unknowns but for a constant.
+    """
+    size = information.shape[0]
+    if criterion == "D":
+        factor = ca.chol(information)
+        return -2 * ca.sum1(ca.log(ca.diag(factor)))
+    covariance = ca.solve(information, type(information).eye(size))
+    if criterion == "A":
+        return ca.log(ca.trace(covariance))
+    scale = ca.trace(covariance)
+    power, times = covariance / scale, exponent
+    while times > 1:
+        power, times = ca.mtimes(power, power), times // 2
+    return ca.log(scale) + ca.log(ca.trace(power)) / exponent
+
+
+def criterion_value(criterion: Criterion, information: np.ndarray) -> float:
+    """The exact value of a criterion; infinite where the information (n, n) is singular."""
+    matrix = np.asarray(information, dtype=float)
+    # The units of the unknowns may differ by orders of magnitude: judged on the matrix with a unit diagonal.
+    diagonal = np.diag(matrix)
+    if np.any(diagonal <= 0):
+        return np.inf
+    root = np.sqrt(diagonal)
+    balanced = np.linalg.eigvalsh(matrix / np.outer(root, root))
+    if balanced[0] < SINGULAR * balanced[-1]:
+        return np.inf
+    if criterion == "D":
+        return float(-np.linalg.slogdet(matrix)[1])
+    values = np.linalg.eigvalsh(np.linalg.inv(matrix))
+    return float(values.sum() if criterion == "A" else values[-1])
+
+
+def efficiency(criterion: Criterion, information: np.ndarray, reference: np.ndarray) -> float:
+    """How many times as long the ``reference`` would have to be measured to be as good as ``information``.
+
+    Both are information matrices (n, n) of equal durations. Information grows with time, so this is the ratio of the
+    criterion for A and E, and the n-th root of the ratio of determinants for D.
+    """
+    ours, theirs = criterion_value(criterion, information), criterion_value(criterion, reference)
+    if criterion == "D":
+        return float(np.exp((theirs - ours) / len(information)))
+    return theirs / ours
+
+
+def _value_and_slope(criterion: Criterion, matrix: np.ndarray) -> tuple[float, np.ndarray]:
+    """The smooth criterion (not its logarithm for A and E) and minus its derivative along the information."""
+    if criterion == "D":
+        inverse = np.linalg.inv(matrix)
+        return float(-np.linalg.slogdet(matrix)[1]), inverse
+    inverse = np.linalg.inv(matrix)
+    if criterion == "A":
+        return float(np.trace(inverse)), inverse @ inverse
+    values, vectors = np.linalg.eigh(inverse)
+    top = values[-1]
+    relative = values / top
+    total = float(np.sum(relative**EXPONENT))
+    value = top * total ** (1 / EXPONENT)
+    slope = top * top * total ** (1 / EXPONENT - 1) * (vectors * relative ** (EXPONENT + 1)) @ vectors.T
+    return float(value), slope
+
+
+@dataclass(frozen=True)
+class Shares:
+    """The best share of the total for each candidate.
+
+    Attributes:
+        weights: (b, k) share of each of k candidates in each of b blocks; every block adds up to its given share.
+        information: (n, n) of the whole design.
+        value: the criterion of that design, exact.
+        bound: no design made of these candidates has a smaller criterion.
+    """
+
+    weights: np.ndarray
+    information: np.ndarray
+    value: float
+    bound: float
+
+
+def best_shares(candidates: np.ndarray, criterion: Criterion, prior: np.ndarray | None = None,
+                tolerance: float = 1e-3, iterations: int = 5000) -> Shares:
+    """The shares of the candidates that make the criterion least, and the bound that proves it.
+
+    Minimises the criterion of ``prior + sum_bk w_bk candidates_bk`` under ``w >= 0`` and ``sum_k w_bk = 1/b`` by the
+    multiplicative algorithm (Silvey, Titterington and Torsney 1978), whose every step improves. The bound is the tangent
+    plane at the answer, below the criterion everywhere since the criterion is convex.
+
+    Args:
+        candidates: (b, k, n, n) or (k, n, n) information of each candidate if it had the whole time; blocks hold
+            shares of their own (parts of the time in which conditions differ).
+        criterion: A, D or E.
+        prior: (n, n) what is known already.
+        tolerance: relative distance of value and bound at which to stop (for D: absolute over n).
+        iterations: most steps; the bound holds wherever the iteration stops.
+
+    Raises:
+        ShapeError: not square matrices.
+        RequestError: all candidates together leave something undetermined.
+    """
+    stack = np.asarray(candidates, dtype=float)
+    if stack.ndim == 3:
+        stack = stack[None]
+    if stack.ndim != 4 or stack.shape[2] != stack.shape[3]:
+        raise ShapeError("the information of candidates must be square matrices", where="candidates",
+                         value=f"shape {stack.shape}", limit="(k, n, n)")
+    blocks, count, size, _ = stack.shape
+    known = np.zeros((size, size)) if prior is None else np.asarray(prior, dtype=float)
+    flat = stack.reshape(blocks, count, size * size)
+    weights = np.full((blocks, count), 1.0 / (blocks * count))
+    matrix = known + np.einsum("bk,bkm->m", weights, flat).reshape(size, size)
+    if not np.isfinite(criterion_value("D", matrix)):
+        raise RequestError("the candidates together leave a direction undetermined", where="candidates",
+                           remedy="allow more motion, or give what is known already")
+    bound = -np.inf
+    for _ in range(iterations):
+        matrix = known + np.einsum("bk,bkm->m", weights, flat).reshape(size, size)
+        value, slope = _value_and_slope(criterion, matrix)
+        gain = flat @ slope.ravel()
+        lowest = value + float(np.sum(slope * (matrix - known))) - float(np.mean(gain.max(axis=1)))
+        bound = max(bound, lowest)
+        if value - bound <= tolerance * (size if criterion == "D" else abs(value)):
+            break
+        grown = weights * np.sqrt(np.maximum(gain, 0.0))
+        weights = grown / (blocks * grown.sum(axis=1, keepdims=True))
+    exact = criterion_value(criterion, matrix)
+    if criterion == "E":
+        bound /= size ** (1 / EXPONENT)
+    return Shares(weights, matrix, exact, min(bound, exact))
