@@ -185,8 +185,18 @@ def earth_and_sun(epoch: str, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     """Velocity (n, 3) m/s of the Earth against the solar system's barycentre, and the Sun (n, 3) m from the Earth.
 
     The Sun's place is geometric (no light time, no aberration: 20 arcseconds). Source: astropy's built-in ephemeris,
-    evaluated at least every half hour and interpolated.
+    evaluated at least every half hour and interpolated; times more than a day apart are taken for themselves.
     """
+    order = np.argsort(time, kind="stable")
+    cuts = np.flatnonzero(np.diff(time[order]) > 86400.0) + 1  # s; years without samples must not cost knots
+    velocity, sun = np.empty((len(time), 3)), np.empty((len(time), 3))
+    for rows in np.split(order, cuts):
+        velocity[rows], sun[rows] = _earth_and_sun_along(epoch, time[rows])
+    return velocity, sun
+
+
+def _earth_and_sun_along(epoch: str, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """:func:`earth_and_sun` at times (n,) s without long gaps."""
     from astropy import units
     from astropy.coordinates import get_body_barycentric, get_body_barycentric_posvel
     from astropy.time import Time, TimeDelta
