@@ -30,6 +30,10 @@ NEGLIGIBLE = 1e-7
 """Sensitivity, relative to the largest, below which a direction of the block is not felt by the other residuals."""
 
 
+CHUNK = 20_000_000
+"""Entries of a sensitivity matrix that are formed at once."""
+
+
 def felt_directions(block: LinearBlock | StretchedBlock,
                     epochs: Sequence[tuple[np.ndarray, int]]) -> tuple[np.ndarray, ...]:
     """Per axis, the orthonormal directions (rank, felt) of zeta that values at ``epochs`` depend on.
@@ -146,6 +150,7 @@ class TrajectoryResidual:
         for axis, directions in enumerate(self.directions):
             signature = np.column_stack([contribution[:, axis], slopes[:, axis, :]])
             projected = self.block.project(signature, axis)
+            residual[:, axis] += self._taken_up(projected[:, 0], axis)
             felt = directions.T @ projected
             size = directions.shape[1]
             # The trajectory has to take up what the effects leave: measured = trajectory + contribution.
@@ -167,6 +172,13 @@ class TrajectoryResidual:
             jacobian[first : first + len(slope), 0, start:] = slope
         jacobian[start:, 0, start:] = root[:, 1:]
         return np.concatenate([*rows, root[:, 0]]), jacobian, residual
+
+    def _taken_up(self, projected: np.ndarray, axis: int) -> np.ndarray:
+        """What the trajectory takes up of an effect at every sample (n,), from its projection (rank,)."""
+        if not np.any(projected):
+            return np.zeros(len(self.time))
+        chunks = np.array_split(self.time, max(1, len(self.time) * len(projected) // CHUNK))
+        return np.concatenate([self.block.sensitivity(t, 0, axis) @ projected for t in chunks])
 
     def prepared(self, values: Values) -> TrajectoryResidual:
         """The residual itself: its weights were settled when the positions were compressed."""

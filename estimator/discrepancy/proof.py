@@ -68,9 +68,15 @@ def _samples(residual: Residual, part: Linearization, held_out: bool) -> tuple[n
     return np.zeros((0, 1)), np.zeros((0, 1))
 
 
-def pays(before: Mapping[str, HeldOut], after: Mapping[str, HeldOut]) -> bool:
-    """Whether the held-out samples of all channels together are predicted better after than before."""
-    return sum(h.square for h in after.values()) < sum(h.square for h in before.values())
+def pays(before: Mapping[str, HeldOut], after: Mapping[str, HeldOut], channels: Sequence[str]) -> bool:
+    """Whether the held-out samples of the channels that an effect changes are predicted better after than before."""
+    chosen = [c for c in channels if c in before and c in after]
+    return sum(after[c].square for c in chosen) < sum(before[c].square for c in chosen)
+
+
+def channels_of(problem: Problem, name: str) -> tuple[str, ...]:
+    """The channels whose residuals depend on the unknown ``name``."""
+    return tuple(dict.fromkeys(r.channel for r in problem.residuals if any(u.name == name for u in r.unknowns)))
 
 
 def shifts(before: Estimate, after: Estimate) -> dict[str, float]:

@@ -18,7 +18,7 @@ from scipy.stats import chi2
 
 from estimator.discrepancy.false_alarm import after_search, effective_looks
 from estimator.discrepancy.gap import Gap, find_gap
-from estimator.discrepancy.proof import HeldOut, misfit, pays, shifts
+from estimator.discrepancy.proof import HeldOut, channels_of, misfit, pays, shifts
 from estimator.discrepancy.score import Score, Signature, Stack, on_rows, scored, settings, signature, stack
 from estimator.discrepancy.subject import Subject
 from estimator.effects.declaration import EffectInstance
@@ -379,7 +379,7 @@ class Workflow:
             if found is None:
                 break
             score, refit, p = found
-            if not self._pays(accepted, refit.effects):
+            if not self._pays(accepted, refit.effects, score.name):
                 excluded.add(score.name)
                 continue
             accepted = self.needed((*accepted, score.name))
@@ -408,10 +408,10 @@ class Workflow:
         return Findings(verdict, why, before, after, findings, tuple(tables), plain, final, tuple(sorted(excluded)),
                         self.round(()).looks, time.perf_counter() - began)
 
-    def _pays(self, before: Sequence[str], after: Sequence[str]) -> bool:
+    def _pays(self, before: Sequence[str], after: Sequence[str], name: str) -> bool:
         first, second = self.fit(before).estimate, self.fit(after).estimate
         return pays(misfit(first.problem, first.parts, held_out=True),
-                    misfit(second.problem, second.parts, held_out=True))
+                    misfit(second.problem, second.parts, held_out=True), channels_of(second.problem, name))
 
     def _findings(self, order: tuple[str, ...], p_values: Mapping[str, float]) -> tuple[Finding, ...]:
         findings = []
