@@ -210,8 +210,8 @@ def method_figure(comparisons: Sequence[Comparison], title: str = "") -> Figure:
         low, high = panel.get_xlim()
         panel.set_xlim(min(low, 0.1), max(high * 3, 30))
         panel.tick_params(axis="y", length=0)
-        what = f"RMS over {len(comparisons)} campaigns (large) and each campaign (small)" if several else "error"
-        panel.set_xlabel(f"{what} over Cramer-Rao sigma; the line is the bound")
+        what = f": RMS over {len(comparisons)} campaigns (large) and each of them (small)" if several else ""
+        panel.set_xlabel(f"error over Cramer-Rao sigma{what}; the line is the bound")
         for key, words in METHODS.items():
             colour, marker = METHOD_STYLE[key]
             panel.plot([], [], marker, ms=8, color=colour, label=words)
