@@ -21,6 +21,7 @@ torque pulses in :mod:`problems.alignment.campaign_design_rotation`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal, get_args
 
 import casadi as ca
@@ -52,7 +53,7 @@ def checked_criterion(name: str) -> Criterion:
 def smooth_criterion(criterion: Criterion, information: Matrix, exponent: int = EXPONENT) -> Matrix:
     """Logarithm of A, D itself, or the logarithm of the smooth stand-in for E, of an information matrix (n x n).
 
-    A CasADi expression; logarithms make the value independent of the unit of the unknowns but for a constant.
+    An SX expression (or numbers); logarithms make the value independent of the unit of the unknowns but for a constant.
     """
     size = information.shape[0]
     if criterion == "D":
@@ -66,6 +67,14 @@ def smooth_criterion(criterion: Criterion, information: Matrix, exponent: int = 
     while times > 1:
         power, times = ca.mtimes(power, power), times // 2
     return ca.log(scale) + ca.log(ca.trace(power)) / exponent
+
+
+@lru_cache(maxsize=16)
+def criterion_function(criterion: Criterion, size: int) -> ca.Function:
+    """CasADi function (information size x size) -> :func:`smooth_criterion`, to be called in any expression."""
+    matrix = ca.SX.sym("information", size, size)
+    return ca.Function(f"criterion_{criterion}", [matrix], [smooth_criterion(criterion, matrix)], ["information"],
+                       ["value"])
 
 
 def criterion_value(criterion: Criterion, information: np.ndarray) -> float:

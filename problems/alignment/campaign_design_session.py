@@ -19,7 +19,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -29,8 +28,9 @@ from estimator.models.earth import GRAVITATIONAL_PARAMETER
 from estimator.models.errors import NotFiniteError, RequestError, ShapeError
 from estimator.models.inertia import inverse3
 from estimator.models.rotations import Matrix
-from problems.alignment.campaign_design import Criterion, best_shares, criterion_value, smooth_criterion
+from problems.alignment.campaign_design import Criterion, best_shares, criterion_function, criterion_value
 from problems.alignment.kernels import doppler_kernel
+from problems.alignment.simulation.pointing import profile_spline
 from problems.alignment.simulation.scenario import Scenario
 
 SPLINE_DEGREE = 3
@@ -242,25 +242,12 @@ def request_of(scenario: Scenario, limits: SlewLimits | None = None, *, duration
         velocity=orbit_axes_velocity(scenario.semi_major_axis, scenario.inclination, u, scenario.earth_rotation_rate))
 
 
-def spline(coefficients: np.ndarray, duration: float) -> Any:
-    """The cubic B-spline (scipy ``BSpline``) of the coefficients (m, 3) on uniform knots over ``duration`` s."""
-    from scipy.interpolate import BSpline
-
-    coefficients = np.asarray(coefficients, dtype=float)
-    return BSpline(_knots(len(coefficients), duration), coefficients, SPLINE_DEGREE)
-
-
-def _knots(count: int, duration: float) -> np.ndarray:
-    inner = np.linspace(0.0, duration, count - SPLINE_DEGREE + 1)
-    return np.concatenate([np.zeros(SPLINE_DEGREE), inner, np.full(SPLINE_DEGREE, duration)])
-
-
 def derivative_maps(count: int, duration: float) -> tuple[np.ndarray, np.ndarray]:
     """Matrices from spline coefficients to those of its first (count - 1, count) and second derivative (count - 2, count).
 
     Every value of a spline lies between the least and the greatest of its coefficients.
     """
-    knots = _knots(count, duration)
+    knots = profile_spline(np.eye(count), duration).t
     first = np.zeros((count - 1, count))
     for i in range(count - 1):
         slope = SPLINE_DEGREE / (knots[i + SPLINE_DEGREE + 1] - knots[i + 1])
@@ -338,7 +325,7 @@ class SessionDesign:
 
     def profile(self, time_of: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Angles (n, 3) rad, rates rad/s and accelerations rad/s2 at times (n,) s after the start."""
-        curve = spline(self.coefficients, self.request.duration)
+        curve = profile_spline(self.coefficients, self.request.duration)
         return curve(time_of), curve.derivative(1)(time_of), curve.derivative(2)(time_of)
 
     @property
@@ -371,7 +358,7 @@ def design_session(request: SessionRequest, criterion: Criterion = "A", *, coeff
     if coefficients < 6 or starts < 1:
         raise RequestError("the design needs 6 coefficients and one start", where="coefficients, starts",
                            value=(coefficients, starts), limit="6 and 1")
-    solver, angle_map, lower, upper = _programme(request, criterion, coefficients)
+    solver, lower, upper = _programme(request, criterion, coefficients)
     found: list[tuple[float, np.ndarray]] = []
     reached = []
     for start in _starts(request, coefficients, starts, seed):
@@ -379,7 +366,7 @@ def design_session(request: SessionRequest, criterion: Criterion = "A", *, coeff
         # Rounding and IPOPT's tolerance aside, what it gives keeps the limits; the rest is scaled into them.
         candidate = _within(request, np.asarray(answer["x"]).reshape(3, coefficients).T * VARIABLE)
         value = criterion_value(criterion, session_information(
-            request, spline(candidate, request.duration)(request.epochs)))
+            request, profile_spline(candidate, request.duration)(request.epochs)))
         reached.append(value)
         if np.isfinite(value):
             found.append((value, candidate))
@@ -388,17 +375,17 @@ def design_session(request: SessionRequest, criterion: Criterion = "A", *, coeff
                            value=(request.limits.angle, request.limits.rate, request.limits.acceleration),
                            remedy="allow more, or make the session longer")
     value, best = min(found, key=lambda pair: pair[0])
-    information = session_information(request, spline(best, request.duration)(request.epochs))
+    information = session_information(request, profile_spline(best, request.duration)(request.epochs))
     return SessionDesign(request, criterion, best, information, value, session_bound(request, criterion),
                          tuple(reached), time.perf_counter() - began)
 
 
 def _programme(request: SessionRequest, criterion: Criterion,
-               count: int) -> tuple[ca.Function, np.ndarray, np.ndarray, np.ndarray]:
-    """IPOPT on the coefficients over VARIABLE, the map from them to node angles, and bounds of the linear constraints."""
+               count: int) -> tuple[ca.Function, np.ndarray, np.ndarray]:
+    """IPOPT on the coefficients over VARIABLE, and the bounds of its linear constraints."""
     nodes = NODES_PER_COEFFICIENT * count
     time_of = (np.arange(nodes) + 0.5) * request.duration / nodes
-    basis = spline(np.eye(count), request.duration)(time_of)
+    basis = profile_spline(np.eye(count), request.duration)(time_of)
     x = ca.MX.sym("x", count, 3)
     angles = VARIABLE * ca.mtimes(ca.DM(basis), x)
     each = _sample(request).map(nodes)(angles.T, ca.DM(request.velocity_at(time_of).T))
@@ -407,7 +394,7 @@ def _programme(request: SessionRequest, criterion: Criterion,
         total[:, column] = ca.sum2(each[:, column::3])
     scale = len(request.epochs) / nodes
     unit = float(np.mean(request.tracker_sigma**2)) / len(request.epochs)
-    objective = smooth_criterion(criterion, unit * (scale * total + ca.DM(request.prior)))
+    objective = criterion_function(criterion, 3)(unit * (scale * total + ca.DM(request.prior)))
     first, second = derivative_maps(count, request.duration)
     limits = request.limits
     rows, lower, upper = [], [], []
@@ -428,7 +415,7 @@ def _programme(request: SessionRequest, criterion: Criterion,
         "print_level": 0, "sb": "yes", "hessian_approximation": "limited-memory", "max_iter": 300, "tol": 1e-6,
         "acceptable_tol": 1e-5, "acceptable_iter": 8, "jac_c_constant": "yes", "jac_d_constant": "yes"}}
     solver = ca.nlpsol("session", "ipopt", {"x": ca.vec(x), "f": objective, "g": ca.vertcat(*rows)}, options)
-    return solver, basis, np.concatenate(lower), np.concatenate(upper)
+    return solver, np.concatenate(lower), np.concatenate(upper)
 
 
 def _within(request: SessionRequest, coefficients: np.ndarray) -> np.ndarray:

@@ -40,7 +40,7 @@ from problems.alignment.simulation.effects import (
     parse_effects,
 )
 from problems.alignment.simulation.orbit import GRAVITATIONAL_PARAMETER, Orbit, initial_state, integrate_orbit
-from problems.alignment.simulation.pointing import Session
+from problems.alignment.simulation.pointing import Session, profile_spline
 from problems.alignment.simulation.rotation import integrate_arc, moving_body
 from problems.alignment.simulation.scenario import PRESETS, Scenario, preset
 from problems.alignment.simulation.truth import ArcState, Truth
@@ -200,8 +200,10 @@ def _commands(world: _World) -> list[tuple[str, float, float, np.ndarray]]:
     arcs = [a for a in world.arcs if a.kind == "torque_pulse"]
     result = []
     for arc, axis in zip(arcs, world.scenario.pulse_axes, strict=True):
+        given = world.scenario.pulse_directions
+        direction = np.array(given[arcs.index(arc)]) if given else np.eye(3)[axis]
         for start, stop, size in world.scenario.pulse_segments:
-            result.append((arc.name, arc.start + start, arc.start + stop, size * np.eye(3)[axis]))
+            result.append((arc.name, arc.start + start, arc.start + stop, size * direction))
     return result
 
 
@@ -212,6 +214,7 @@ def _set_in_motion(
     scenario = world.scenario
     session_draw, free_draw, pulse_draw = (world.draws[p] for p in ("sessions", "free", "pulses"))
     tracker_from_antenna = _matrix(_unit(scenario.antenna_from_tracker)).T
+    given_rates = iter(scenario.free_initial_rates)
     states: dict[str, ArcState] = {}
     for arc in world.arcs:
         if arc.kind == "doppler":
@@ -219,12 +222,16 @@ def _set_in_motion(
             offset[0] += scenario.look_angle
             world.motions[arc.name] = Session(
                 arc.start, offset, np.asarray(scenario.slew_amplitude), session_draw.uniform(*scenario.slew_period, 3),
-                session_draw.uniform(0.0, 2.0 * np.pi, 3), tracker_from_antenna, world.orbit)
+                session_draw.uniform(0.0, 2.0 * np.pi, 3), tracker_from_antenna, world.orbit,
+                profile_spline(np.array(scenario.slew_profile), scenario.session_duration)
+                if scenario.slew_profile else None)
             continue
         free = arc.kind == "free_rotation"
         draw = free_draw if free else pulse_draw
         attitude = sensors.random_matrix(draw)
         rate = _tumbling(world, draw) if free else scenario.pulse_initial_rate * draw.standard_normal(3)
+        if free and scenario.free_initial_rates:
+            rate = np.array(next(given_rates))
         segments = [(start, stop, command) for name, start, stop, command in torque if name == arc.name]
         motion = integrate_arc(arc.start, arc.stop, attitude.T, rate, world.inertia, segments,
                                rotation.right_side(arc.start, arc.stop), rotation.states)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import BSpline
 
 from problems.alignment.simulation.orbit import Orbit
 
@@ -23,6 +24,8 @@ class Session:
         amplitude, period, phase: (3) rad, s, rad of the swing of each angle.
         tracker_from_antenna: (3, 3) as the attitude control believes it.
         orbit: the true orbit.
+        profile: where given, the angles (3, rad) of time after the start that are added to ``offset`` in place of
+            the sines; see :func:`profile_spline`.
     """
 
     start: float
@@ -32,14 +35,19 @@ class Session:
     phase: np.ndarray
     tracker_from_antenna: np.ndarray
     orbit: Orbit
+    profile: BSpline | None = None
 
     def __call__(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """``tracker_from_inertial`` matrices (n, 3, 3) and rates (n, 3) rad/s of the body in tracker axes."""
         time = np.asarray(time, dtype=float)
         frame, frame_slope = orbit_frame(self.orbit, time)
-        argument = 2.0 * np.pi * (time[:, None] - self.start) / self.period + self.phase
-        angle = self.offset + self.amplitude * np.sin(argument)
-        slope = self.amplitude * np.cos(argument) * 2.0 * np.pi / self.period
+        if self.profile is None:
+            argument = 2.0 * np.pi * (time[:, None] - self.start) / self.period + self.phase
+            angle = self.offset + self.amplitude * np.sin(argument)
+            slope = self.amplitude * np.cos(argument) * 2.0 * np.pi / self.period
+        else:
+            angle = self.offset + self.profile(time - self.start)
+            slope = self.profile(time - self.start, 1)
         turns = [_turn(axis, angle[:, axis], slope[:, axis]) for axis in range(3)]
         # Yaw first, then pitch, then roll with the look angle in its constant part.
         product, product_slope = frame, frame_slope
@@ -52,6 +60,13 @@ class Session:
         rate = 0.5 * np.stack([skew[:, 2, 1] - skew[:, 1, 2], skew[:, 0, 2] - skew[:, 2, 0],
                                skew[:, 1, 0] - skew[:, 0, 1]], axis=1)
         return attitude, rate
+
+
+def profile_spline(coefficients: np.ndarray, duration: float) -> BSpline:
+    """Cubic B-spline of the coefficients (m, 3) rad, clamped, with uniform knots over ``duration`` s."""
+    coefficients = np.asarray(coefficients, dtype=float)
+    inner = np.linspace(0.0, duration, len(coefficients) - 2)
+    return BSpline(np.concatenate([np.zeros(3), inner, np.full(3, duration)]), coefficients, 3)
 
 
 def orbit_frame(orbit: Orbit, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -48,11 +48,18 @@ class Scenario:
         pointing_spread: rad, standard deviation of the constant offset of a session about antenna x, y, z.
         slew_amplitude, slew_period: rad about antenna x, y, z; shortest and longest period in s. In a session each
             angle swings as a sine with a drawn phase.
+        slew_profile: where not empty, the manoeuvre of every session instead of the sines: coefficients (at least 4
+            rows of three, rad about antenna x, y, z) of cubic B-splines with uniform knots over the session, added to
+            the look angle and the drawn offset.
         free_arcs, free_duration, free_rate, free_spacing: number; s; rad/s; s between arcs.
         free_axis_clearance: rad, least angle between the initial rate and every principal axis.
+        free_initial_rates: where not empty, the rates (rad/s, tracker axes) at the start of the free arcs, one for
+            each, instead of drawn ones.
         pulse_axes: one torque arc for each entry, on that actuator axis (0, 1, 2).
         pulse_duration, pulse_spacing: s.
         pulse_segments: (start, stop, torque) for each segment of a torque arc, s after its start and N m.
+        pulse_directions: where not empty, direction (3, actuator axes) of the torque of each torque arc instead of
+            its axis; the torque of a segment is its number times this vector.
         pulse_initial_rate: rad/s, standard deviation of each component of the rate at the start of a torque arc.
         antenna_from_tracker, actuator_from_tracker: nominal quaternions.
         mounting_spread: rad, standard deviation about each axis of the true mounting against the nominal one.
@@ -100,16 +107,19 @@ class Scenario:
     pointing_spread: Vector = (15.0 * DEGREE, 8.0 * DEGREE, 10.0 * DEGREE)
     slew_amplitude: Vector = (8.0 * DEGREE, 5.0 * DEGREE, 5.0 * DEGREE)
     slew_period: Interval = (240.0, 480.0)
+    slew_profile: tuple[Vector, ...] = ()
 
     free_arcs: int = 3
     free_duration: float = 600.0
     free_rate: float = 0.75 * DEGREE
     free_spacing: float = 200.0
     free_axis_clearance: float = 20.0 * DEGREE
+    free_initial_rates: tuple[Vector, ...] = ()
     pulse_axes: tuple[int, ...] = (0, 1, 2)
     pulse_duration: float = 120.0
     pulse_spacing: float = 180.0
     pulse_segments: tuple[tuple[float, float, float], ...] = ((10.0, 40.0, 0.6), (40.0, 70.0, -0.6), (80.0, 100.0, 0.4))
+    pulse_directions: tuple[Vector, ...] = ()
     pulse_initial_rate: float = 0.03 * DEGREE
 
     antenna_from_tracker: Quaternion = (0.970443150, -0.165623190, -0.123728550, -0.124500210)
@@ -156,6 +166,13 @@ class Scenario:
                                value=self.star_tracker_noise, remedy="give three standard deviations in rad")
         if any(axis not in (0, 1, 2) for axis in self.pulse_axes):
             raise RequestError("an actuator axis is 0, 1 or 2", where="scenario.pulse_axes", value=self.pulse_axes)
+        if 0 < len(self.slew_profile) < 4:
+            raise RequestError("a profile has too few coefficients", where="scenario.slew_profile",
+                               value=len(self.slew_profile), limit="4 or more, or none")
+        for name, arcs in (("free_initial_rates", self.free_arcs), ("pulse_directions", len(self.pulse_axes))):
+            if getattr(self, name) and len(getattr(self, name)) != arcs:
+                raise RequestError("each arc needs one", where=f"scenario.{name}", value=len(getattr(self, name)),
+                                   limit=f"{arcs}, or none")
         previous = 0.0
         for start, stop, _ in self.pulse_segments:
             if not previous <= start < stop <= self.pulse_duration:
@@ -188,10 +205,11 @@ def _require_kind(name: str, value: Any, default: Any) -> None:
     elif isinstance(default, tuple):
         numbers = np.asarray(_flat(value) if isinstance(value, tuple) else [None], dtype=object)
         good = isinstance(value, tuple) and all(isinstance(x, int | float) and math.isfinite(x) for x in numbers)
-        fixed = name not in ("zonal_coefficients", "pulse_axes", "pulse_segments") and not name.endswith("_gaps")
+        triples = name in ("pulse_segments", "slew_profile", "free_initial_rates", "pulse_directions")
+        fixed = name not in ("zonal_coefficients", "pulse_axes") and not triples and not name.endswith("_gaps")
         good = good and (not fixed or np.shape(value) == np.shape(default))
-        row = 3 if name == "pulse_segments" else 2
-        if name == "pulse_segments" or name.endswith("_gaps"):
+        row = 3 if triples else 2
+        if triples or name.endswith("_gaps"):
             good = good and all(isinstance(x, tuple) and len(x) == row for x in value)
     else:
         good = number or (default is None and value is None)
