@@ -229,7 +229,9 @@ class _Orbit:
 
     def __init__(self, model: AlignmentModel, stop: float):
         self.model = model
-        self.epoch = float(model.frame.stop) - 60.0  # the fitted velocity is best a little inside the data
+        # The fitted velocity is best a little inside the data.
+        first, last = float(model.campaign.gnss.time[0]), float(model.campaign.gnss.time[-1])
+        self.epoch = last - min(60.0, 0.1 * (last - first))
         at = np.array([self.epoch])
         turn = self._inertial_from_fixed(at)
         spin = np.array([0.0, 0.0, model.campaign.earth_rotation_rate])
@@ -284,7 +286,7 @@ def _usual_attitude(model: AlignmentModel) -> Rotation:
     sessions = model.campaign.arcs_of_kind("doppler")
     middle = 0.5 * (sessions[0].start + sessions[0].stop) if sessions else float(tracker.time[len(tracker.time) // 2])
     nearest = int(np.argmin(np.abs(tracker.time - middle)))
-    at = np.clip(tracker.time[nearest : nearest + 1], model.frame.start, model.frame.stop)
+    at = np.clip(tracker.time[nearest : nearest + 1], model.campaign.gnss.time[0], model.campaign.gnss.time[-1])
     angle = model.earth_angle(at)
     turn = Rotation.from_rotvec(np.column_stack([0 * angle, 0 * angle, angle]))
     position = turn.apply(model.position(at))
