@@ -54,3 +54,32 @@ def solve_command(
         return solution.as_dict(), lambda: str(solution)
 
     console.run(work, as_json=as_json)
+
+
+@app.command("explain")
+def explain_command(
+    files: Files,
+    settings: Settings = None,
+    hold_out: Annotated[float, typer.Option(help="fraction of the data kept from the fits for the proof")] = 0.2,
+    without: Annotated[str, typer.Option(help="effects to leave out of the library, separated by commas")] = "",
+    as_json: AsJson = False,
+) -> None:
+    """Find what separates the measurements from the model of the orbit, name it, and prove that the gap shrank."""
+
+    def work() -> tuple[dict[str, Any], Callable[[], object]]:
+        from estimator.models.errors import RequestError
+        from problems.geo_orbit.explanation import explained
+        from problems.readers.tracking_files import read_files
+
+        if not 0.05 <= hold_out <= 0.5:
+            raise RequestError("the held-out fraction makes no sense", where="--hold-out", value=hold_out,
+                               limit="0.05 to 0.5")
+        with console.progress() as bar:
+            task = bar.add_task("reading", total=None)
+            tracking, chosen = read_files(files, settings)
+            found = explained(tracking, chosen, hold_out=hold_out,
+                              without=[n.strip() for n in without.split(",") if n.strip()],
+                              say=lambda text: bar.update(task, description=text, advance=1))
+        return found.as_dict(), lambda: str(found)
+
+    console.run(work, as_json=as_json)

@@ -34,7 +34,7 @@ from estimator.models.ranging import COMPONENTS, UNITS, Signalling
 from estimator.problem import Problem
 from estimator.residuals import KernelResidual, Residual
 from estimator.unknowns import Unknown, Vector
-from problems.geo_orbit.effects import OrbitEffect, OrbitLayout, chosen
+from problems.geo_orbit.effects import OrbitEffect, OrbitLayout, chosen, instances
 from problems.geo_orbit.kernels import Correcting, measurement_data, measurement_kernel
 from problems.geo_orbit.settings import OrbitSettings
 from problems.geo_orbit.tracking import Observations, Station, Tracking
@@ -246,7 +246,9 @@ def orbit_problem(model: OrbitModel, effects: Sequence[str] = (), *, candidates:
     """
     active = chosen(model.layout, effects)
     dormant = tuple(e for e in chosen(model.layout, candidates) if e not in active)
-    everything = (*active, *dormant)
+    # Always in the library's order: the compiled equations then do not depend on which of them are estimated.
+    order = {e.name: i for i, e in enumerate(instances(model.layout))}
+    everything = tuple(sorted((*active, *dormant), key=lambda e: order[e.name]))
     s = model.settings
     present, values, force_unknowns = _accelerations(model)
     unknowns: dict[str, Unknown] = {}
