@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimator.models.orbit_signal import OrbitSignal
+from estimator.orbit_signal import OrbitSignal
 from estimator.residuals import KernelResidual
 from problems.geo_orbit.solution import OrbitSolution
 from problems.readers.tracking_ccsds import Ephemeris

@@ -14,7 +14,7 @@ import numpy as np
 
 from estimator.models.light_time import Earth
 from estimator.models.orbit_environment import SpaceEnvironment
-from estimator.models.orbit_signal import STATE
+from estimator.orbit_signal import STATE
 from estimator.models.ranging import SIZES, Antenna, Corrections, Kind, Signalling, difference, predicted
 from estimator.models.station import east_north_up, station_position
 from estimator.residuals import Kernel

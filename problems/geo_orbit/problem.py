@@ -29,7 +29,7 @@ from estimator.models.orbit_motion import (
     motion,
     motion_inputs,
 )
-from estimator.models.orbit_signal import OrbitArc, OrbitSignal, VelocityStep, position_unknown, velocity_unknown
+from estimator.orbit_signal import OrbitArc, OrbitSignal, VelocityStep, position_unknown, velocity_unknown
 from estimator.models.ranging import COMPONENTS, UNITS, Signalling
 from estimator.problem import Problem
 from estimator.residuals import KernelResidual, Residual
