@@ -40,7 +40,7 @@ class AlignmentSubject:
     def training(self) -> AlignmentModel:
         """The same with a part of every arc held out."""
         full = self.everything
-        return alignment_model(full.campaign, degree=full.frame.degree, hold_out=self.hold_out)
+        return alignment_model(full.campaign, frame=full.frame, hold_out=self.hold_out)
 
     @cached_property
     def library(self) -> tuple[EffectInstance, ...]:
