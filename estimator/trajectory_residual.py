@@ -164,7 +164,10 @@ class TrajectoryResidual:
         scale = np.sqrt(np.maximum(np.diag(gram), 0.0))
         scale[scale == 0] = 1.0
         eigenvalues, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
-        root = (vectors * np.sqrt(np.maximum(eigenvalues, 0.0))).T * scale
+        # Triangular, the residual first: its row is the same whatever effects are beside it, so that rows of problems
+        # with different effects can be compared.
+        root = np.asarray(np.linalg.qr((vectors * np.sqrt(np.maximum(eigenvalues, 0.0))).T, mode="r")) * scale
+        root *= np.where(np.diag(root) < 0, -1.0, 1.0)[:, None]
         total = start + columns + 1
         jacobian = np.zeros((total, 1, start + columns))
         jacobian[range(start), 0, range(start)] = 1.0
