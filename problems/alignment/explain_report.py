@@ -55,7 +55,7 @@ class Trace:
         place: (n,) position on the axis: minutes of data with the time between arcs taken out.
         arc: (n,) number of the arc.
         edges: (start, stop, name) of each arc on the axis.
-        before, after: (n, m) residuals.
+        before, after: (n, m) residuals, decorrelated.
         fitted: (n,) True for the samples in the fit, False for those held out.
         floor: (m,) noise of each component.
     """
@@ -105,8 +105,8 @@ def trace(first: Estimate, second: Estimate, channel: str) -> Trace | None:
         else:
             continue
         factor, unit = readable(1.0, residual.unit)
-        before.append(one.residual * factor)
-        after.append(two.residual * factor)
+        before.append(_decorrelated(residual, one.residual) * factor)
+        after.append(_decorrelated(residual, two.residual) * factor)
         sigma[-1] = sigma[-1] * factor
     if not times:
         return None
@@ -127,6 +127,23 @@ def trace(first: Estimate, second: Estimate, channel: str) -> Trace | None:
     order = np.argsort(place, kind="stable")
     return Trace(channel, unit, place[order], label[order], tuple(edges), np.concatenate(before)[order],
                  np.concatenate(after)[order], np.concatenate(fitted)[order], noise)
+
+
+def _decorrelated(residual: Any, raw: np.ndarray) -> np.ndarray:
+    """Residuals with errors that the components share (the tracker's noise in every beam) weighted down.
+
+    The symmetric root of the inverse covariance keeps each component what it is; the result has the size of the
+    declared noise where there is nothing but noise.
+    """
+    factor = getattr(residual, "factor", None)
+    if factor is None or raw.shape[1] == 1:
+        return raw
+    inverse = np.swapaxes(factor, 1, 2) @ factor
+    if not np.any(inverse[:, ~np.eye(raw.shape[1], dtype=bool)]):
+        return raw
+    values, vectors = np.linalg.eigh(inverse)
+    root = (vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+    return np.asarray(np.einsum("nij,nj->ni", root, raw) * residual.standard_deviation)
 
 
 def _matched(first: Estimate, second: Estimate) -> list[Any]:
@@ -417,8 +434,8 @@ def _finding_block(explanation: Explanation, finding: Finding, before: Sequence[
     block.append("</p>")
     if items:
         block.append(f"<figure>{finding_figure(items, held_out)}<figcaption>Dots: samples. Lines: means over short "
-                     "stretches. The signature is what the effect changed after everything else was refitted. Right: "
-                     "samples that no fit used, in the component that the effect changes most.</figcaption></figure>")
+                     "stretches. Errors that all beams share are weighted down as in the fit. The signature is "
+                     "what the effect changed after everything else was refitted. Right: samples that no fit used, in the component that the effect changes most.</figcaption></figure>")
     fitted = parameters_of(final, effect)
     rows = []
     for i, p in enumerate(effect.parameters):
