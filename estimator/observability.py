@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg.lapack import dpotrf, dtrtri
 
 from estimator.unknowns import UnitQuaternion, Unknown, offsets
 
@@ -38,6 +39,27 @@ class WeakDirection:
     vector: np.ndarray
 
 
+def determined(matrix: np.ndarray, threshold: float = UNDETERMINED) -> bool:
+    """Whether the data determine every direction: a cheap bound first, the spectrum only where that cannot tell.
+
+    Args:
+        matrix: Gauss-Newton matrix in scaled tangent coordinates.
+        threshold: ratio of posterior to prior sigma.
+    """
+    if not len(matrix):
+        return True
+    factor, failed = dpotrf(matrix, lower=1)
+    if failed:
+        return False
+    inverse, failed = dtrtri(factor, lower=1)
+    if failed:
+        return False
+    # The sum of all variances bounds the largest.
+    size = float(np.linalg.norm(inverse))
+    return size < threshold or (size < threshold * np.sqrt(len(matrix))
+                                and float(np.linalg.norm(inverse, 2)) < threshold)
+
+
 def weak_directions(matrix: np.ndarray, unknowns: Sequence[Unknown],
                     threshold: float = UNDETERMINED) -> list[WeakDirection]:
     """Directions whose posterior sigma exceeds ``threshold`` prior sigmas, weakest first.
@@ -47,6 +69,8 @@ def weak_directions(matrix: np.ndarray, unknowns: Sequence[Unknown],
         unknowns: the free unknowns, in the order of the columns.
         threshold: ratio of posterior to prior sigma.
     """
+    if determined(matrix, threshold):
+        return []
     eigenvalues, vectors = np.linalg.eigh(matrix)
     found = []
     floor = np.finfo(float).eps * max(float(eigenvalues[-1]), 1.0) * len(eigenvalues)

@@ -139,6 +139,19 @@ class NormalEquations:
     matrix: np.ndarray
     gradient: np.ndarray
     cost: float
+    shares: tuple[tuple[np.ndarray, np.ndarray] | None, ...] = ()
+    """Of each residual: its columns, and its part of the matrix in physical coordinates."""
+
+
+def weighted_rows(part: Linearization, pick: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Jacobian (n m, columns ``pick``) and whitened residual (n m) of a residual, weighted; copied only where needed."""
+    n, m, p = part.jacobian.shape
+    rows = part.jacobian if np.array_equal(pick, np.arange(p)) else part.jacobian[:, :, pick]
+    right = part.whitened
+    if not (part.weight == 1.0).all():
+        root = np.sqrt(part.weight)[:, None]
+        rows, right = rows * root[:, :, None], right * root
+    return rows.reshape(n * m, len(pick)), right.reshape(n * m)
 
 
 def normal_equations(problem: Problem, values: Mapping[str, np.ndarray], parts: Sequence[Linearization],
@@ -149,6 +162,7 @@ def normal_equations(problem: Problem, values: Mapping[str, np.ndarray], parts: 
     scales = np.concatenate([np.zeros(0), *(u.scales for u in chosen)])
     total = len(scales)
     matrix, gradient, cost = np.zeros((total, total)), np.zeros(total), 0.0
+    shares: list[tuple[np.ndarray, np.ndarray] | None] = []
     for part in parts:
         picks, index, position = [], [], 0
         for u in part.columns:
@@ -159,18 +173,22 @@ def normal_equations(problem: Problem, values: Mapping[str, np.ndarray], parts: 
             position += width
         cost += part.cost
         if not picks:
+            shares.append(None)
             continue
         pick, place = np.concatenate(picks), np.concatenate(index)
         if not len(pick):
+            shares.append(None)
             continue  # nothing else feels the trajectory: the positions have no columns
-        root = np.sqrt(part.weight)[:, None]
-        rows = (part.jacobian[:, :, pick] * root[:, :, None]).reshape(-1, len(pick)) * scales[place]
-        right = (part.whitened * root).reshape(-1)
-        matrix[np.ix_(place, place)] += rows.T @ rows
+        rows, right = weighted_rows(part, pick)
+        share = rows.T @ rows
+        shares.append((place, share))
+        matrix[np.ix_(place, place)] += share
         gradient[place] += rows.T @ right
+    matrix *= np.outer(scales, scales)
+    gradient *= scales
     deviation, active = problem.prior_terms(values)
     if unknowns is None:
         matrix[active, active] += 1.0
         gradient += np.where(active, deviation, 0.0)
     cost += float(np.sum(deviation**2))
-    return NormalEquations(matrix, gradient, cost)
+    return NormalEquations(matrix, gradient, cost, tuple(shares))

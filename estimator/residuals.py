@@ -210,17 +210,25 @@ class KernelResidual:
         columns = self.unknowns
         width = {u.name: u.manifold.tangent for u in columns}
         starts = dict(zip(width, np.concatenate([[0], np.cumsum(list(width.values()))[:-1]]).astype(int), strict=True))
-        jacobian = np.zeros((self.samples, self.kernel.size, sum(width.values())))
+        jacobian = np.empty((self.samples, self.kernel.size, sum(width.values())))
+        written: set[str] = set()
+
+        def add(unknown: Unknown, block: np.ndarray) -> None:
+            place = jacobian[:, :, starts[unknown.name] : starts[unknown.name] + width[unknown.name]]
+            if unknown.name in written:
+                place += block
+            else:
+                place[:] = block
+                written.add(unknown.name)
+
         for unknown in self.kernel.unknowns:
-            a = starts[unknown.name]
-            jacobian[:, :, a : a + width[unknown.name]] += factor @ jacobians[unknown.name]
+            add(unknown, factor @ jacobians[unknown.name])
         for signal in self.signals:
             chained = (factor @ jacobians[signal.name]) @ signal_jacobians[signal.name]
             position = 0
             for unknown in signal.unknowns:
-                a, w = starts[unknown.name], width[unknown.name]
-                jacobian[:, :, a : a + w] += chained[:, :, position : position + w]
-                position += w
+                add(unknown, chained[:, :, position : position + width[unknown.name]])
+                position += width[unknown.name]
         whitened = np.einsum("nij,nj->ni", factor, residual)
         square = np.einsum("ni,ni->n", whitened, whitened)
         keep = np.ones(self.samples) if self.accepted is None else self.accepted.astype(float)

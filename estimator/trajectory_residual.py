@@ -42,7 +42,8 @@ def felt_directions(block: LinearBlock | StretchedBlock,
         block: the compressed positions.
         epochs: (times, order of the derivative) of every value that another residual uses.
     """
-    result = []
+    result: list[np.ndarray] = []
+    previous = np.zeros((0, 0))
     for axis in range(block.coefficients.shape[1]):
         stacked = []
         for times, derivative in epochs:
@@ -54,11 +55,34 @@ def felt_directions(block: LinearBlock | StretchedBlock,
             result.append(np.zeros((int(block.ranks[axis]), 0)))
             continue
         rows = np.concatenate(stacked)
-        if len(rows) > rows.shape[1]:
-            rows = np.asarray(np.linalg.qr(rows, mode="r"))
-        _, singular, vectors = np.linalg.svd(rows, full_matrices=False)
-        result.append(vectors[singular > NEGLIGIBLE * singular[0]].T)
+        # Axes that are measured alike feel alike.
+        alike = result and rows.shape == previous.shape and float(np.max(np.abs(rows - previous))) < 1e-12
+        result.append(result[-1] if alike else _row_space(rows))
+        previous = rows
     return tuple(result)
+
+
+def _row_space(rows: np.ndarray) -> np.ndarray:
+    """Orthonormal directions (columns, r) along which ``rows`` have singular values that are not negligible.
+
+    A few sessions feel a small part of a long trajectory: the space is first caught by products with more random
+    vectors than it has dimensions, and decomposed inside that.
+    """
+    most, columns = min(rows.shape), rows.shape[1]
+    draw = np.random.default_rng(0)
+    size = 128
+    while 2 * size < most:
+        caught = np.linalg.qr(rows.T @ draw.standard_normal((len(rows), size)))[0]
+        inside = rows @ caught
+        _, singular, vectors = np.linalg.svd(np.linalg.qr(inside, mode="r"), full_matrices=False)
+        kept = singular > NEGLIGIBLE * singular[0]
+        if kept.sum() < 0.8 * size:
+            return np.asarray(caught @ vectors[kept].T)
+        size *= 2
+    if len(rows) > columns:
+        rows = np.asarray(np.linalg.qr(rows, mode="r"))
+    _, singular, vectors = np.linalg.svd(rows, full_matrices=False)
+    return np.asarray(vectors[singular > NEGLIGIBLE * singular[0]].T)
 
 
 @dataclass(frozen=True, eq=False)

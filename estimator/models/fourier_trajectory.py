@@ -37,6 +37,7 @@ from estimator.models._polynomial_cells import evaluate_in_cells
 from estimator.models.errors import RequestError, ShapeError
 
 _DENSE_ENTRIES = 3_000_000  # entries of a basis matrix that may be formed at once
+_FINE_TABLE = 32  # multiples of the phase whose sines are computed; the others are products
 
 
 Symbolic = TypeVar("Symbolic", ca.SX, ca.MX)
@@ -109,18 +110,25 @@ class FourierFrame:
         """Fill ``even`` (n, D+1) with the columns that start as cosines and ``odd`` (n, D) with the sines."""
         order = _whole_order(derivative)
         frequency = self.frequencies
-        phase = np.multiply.outer(time - self.middle, frequency)
         gain = frequency**order
+        cosine, sine = self._harmonics(time)
         # cos, -sin, -cos, sin and sin, cos, -sin, -cos: the derivative turns the phase by a quarter each time.
-        if order % 2 == 0:
-            np.cos(phase, out=even)
-            np.sin(phase[:, 1:], out=odd)
-        else:
-            np.sin(phase, out=even)
-            np.cos(phase[:, 1:], out=odd)
+        even[:] = cosine if order % 2 == 0 else sine
+        odd[:] = (sine if order % 2 == 0 else cosine)[:, 1:]
         if order:
             even *= gain * (-1.0 if order % 4 in (1, 2) else 1.0)
             odd *= gain[1:] * (-1.0 if order % 4 in (2, 3) else 1.0)
+
+    def _harmonics(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Cosines and sines (n, D+1) of all multiples of the phase: products of a coarse and a fine table of them."""
+        phase = np.pi / self.span * (time - self.middle)
+        if self.degree < 2 * _FINE_TABLE:
+            angle = np.multiply.outer(phase, np.arange(self.degree + 1))
+            return np.cos(angle), np.sin(angle)
+        fine = np.exp(1j * np.multiply.outer(phase, np.arange(_FINE_TABLE)))
+        coarse = np.exp(1j * np.multiply.outer(phase, np.arange(0, self.degree + 1, _FINE_TABLE)))
+        table = (coarse[:, :, None] * fine[:, None, :]).reshape(time.size, -1)[:, : self.degree + 1]
+        return table.real, table.imag
 
     def basis_symbolic(self, time: Symbolic, derivative: int = 0) -> Symbolic:
         """The columns at one symbolic time: (size, 1), equal to a row of :meth:`basis`.

@@ -12,9 +12,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 
 from estimator.estimate import Estimate
-from estimator.observability import UNDETERMINED
+from estimator.observability import UNDETERMINED, determined
 from estimator.problem import NormalEquations, Problem, normal_equations
 from estimator.residuals import Linearization
 from estimator.solvers.summary import summarized
@@ -55,12 +56,16 @@ def solve(problem: Problem, options: Options | None = None) -> Estimate:
     iterations, reason, converged = 0, "", False
     prepared = problem.prepared(values)
     parts = prepared.linearize(values)
+    equations = normal_equations(prepared, values, parts)
     while iterations < options.iterations:
         at_entry = values
-        values, parts, used, reason = _minimize(prepared, values, parts, options, iterations)
+        values, parts, used, reason = _minimize(prepared, values, parts, equations, options, iterations)
         iterations += used
-        prepared = problem.prepared(values)
-        parts = prepared.linearize(values)
+        renewed = problem.prepared(values)
+        # What has no whitening to renew has been linearized here already.
+        parts = [part if new is old else new.linearize(values)
+                 for new, old, part in zip(renewed.residuals, prepared.residuals, parts, strict=True)]
+        prepared = renewed
         equations = normal_equations(prepared, values, parts)
         moved = _sigmas(equations, prepared, at_entry, values)
         decrement = _decrement(equations)
@@ -74,14 +79,13 @@ def solve(problem: Problem, options: Options | None = None) -> Estimate:
     if not converged and not reason:
         reason = f"no convergence in {iterations} iterations; the start may be far from any solution"
     return summarized(prepared, values, parts, converged=converged, reason=reason, iterations=iterations,
-                      solver="gauss-newton", seconds=time.perf_counter() - began)
+                      solver="gauss-newton", seconds=time.perf_counter() - began, equations=equations)
 
 
-def _minimize(problem: Problem, values: Mapping[str, np.ndarray], parts: list[Linearization], options: Options,
-              done: int) -> tuple[Mapping[str, np.ndarray], list[Linearization], int, str]:
+def _minimize(problem: Problem, values: Mapping[str, np.ndarray], parts: list[Linearization],
+              equations: NormalEquations, options: Options, done: int) -> tuple[Mapping[str, np.ndarray], list[Linearization], int, str]:
     """Damped Gauss-Newton steps with frozen whitening until the step is small; returns the reason if it gives up."""
     damping, growth, used = options.damping, 4.0, 0
-    equations = normal_equations(problem, values, parts)
     scales = np.concatenate([np.zeros(0), *(u.scales for u in problem.free)])
     while done + used < options.iterations:
         step = _damped_step(equations, damping)
@@ -123,16 +127,9 @@ def _damped_step(equations: NormalEquations, damping: float) -> np.ndarray:
     """Step in scaled coordinates; directions that the data do not determine get none."""
     matrix = equations.matrix
     diagonal = np.diag(matrix)
-    try:
-        # A direction weaker than the threshold shows as a small pivot; only then is the spectrum worth its price.
-        factor = np.linalg.cholesky(matrix)
-        inverse_norm = np.linalg.norm(np.linalg.inv(factor), 2)
-        sound = bool(inverse_norm < UNDETERMINED)
-    except np.linalg.LinAlgError:
-        sound = False
-    if sound:
-        damped = matrix + damping * np.diag(diagonal)
-        return -np.linalg.solve(damped, equations.gradient)
+    if determined(matrix):
+        factor = cho_factor(matrix + damping * np.diag(diagonal), lower=True, check_finite=False)
+        return np.asarray(-cho_solve(factor, equations.gradient, check_finite=False))
     eigenvalues, vectors = np.linalg.eigh(matrix)
     kept = eigenvalues >= 1.0 / UNDETERMINED**2
     basis = vectors[:, kept]

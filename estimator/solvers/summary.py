@@ -9,16 +9,16 @@ import numpy as np
 from estimator.consistency import consistency
 from estimator.estimate import Estimate, ResidualSummary, Status
 from estimator.observability import weak_directions
-from estimator.problem import Problem, normal_equations
+from estimator.problem import NormalEquations, Problem, normal_equations
 from estimator.residuals import Linearization, Residual
-from estimator.unknowns import offsets
 
 GAP_LEVEL = 1 - 6.3e-5
 """Two-sided level of the chi-square test of each residual (4 standard deviations)."""
 
 
 def summarized(problem: Problem, values: Mapping[str, np.ndarray], parts: Sequence[Linearization], *, converged: bool,
-               reason: str, iterations: int, solver: str, seconds: float) -> Estimate:
+               reason: str, iterations: int, solver: str, seconds: float,
+               equations: NormalEquations | None = None) -> Estimate:
     """The estimate at ``values``, with everything that a user needs to trust it or not.
 
     Args:
@@ -28,14 +28,16 @@ def summarized(problem: Problem, values: Mapping[str, np.ndarray], parts: Sequen
         converged: whether the solver met its tolerance.
         reason: the sentence when it did not.
         iterations, solver, seconds: for the record.
+        equations: the normal equations at ``values`` where the solver has them.
     """
     free = problem.free
-    equations = normal_equations(problem, values, parts)
+    equations = equations or normal_equations(problem, values, parts)
     scales = np.concatenate([np.zeros(0), *(u.scales for u in free)])
     weak = weak_directions(equations.matrix, free) if len(scales) else []
     covariance = _pseudo_inverse(equations.matrix, len(weak)) * np.outer(scales, scales)
     summaries = tuple(
-        _summary(residual, part, covariance, problem) for residual, part in zip(problem.residuals, parts, strict=True)
+        _summary(residual, part, covariance, share)
+        for residual, part, share in zip(problem.residuals, parts, equations.shares, strict=True)
     )
     gaps = [s for s in summaries if s.consistency.verdict == "too large"]
     status, sentences = Status.OK, []
@@ -66,21 +68,12 @@ def _pseudo_inverse(matrix: np.ndarray, dropped: int) -> np.ndarray:
     return (kept / eigenvalues[dropped:]) @ kept.T
 
 
-def _summary(residual: Residual, part: Linearization, covariance: np.ndarray, problem: Problem) -> ResidualSummary:
-    columns = offsets(problem.free)
-    picks, places, position = [], [], 0
-    for u in part.columns:
-        width = u.manifold.tangent
-        if u.name in columns:
-            picks.append(np.arange(position, position + width))
-            places.append(np.arange(columns[u.name].start, columns[u.name].stop))
-        position += width
+def _summary(residual: Residual, part: Linearization, covariance: np.ndarray,
+             share: tuple[np.ndarray, np.ndarray] | None) -> ResidualSummary:
     used = 0.0
-    if picks:
-        pick, place = np.concatenate(picks), np.concatenate(places)
-        rows = part.jacobian[:, :, pick] * np.sqrt(part.weight)[:, None, None]
-        flat = rows.reshape(rows.shape[0] * rows.shape[1], len(pick))
-        used = float(np.sum((flat.T @ flat) * covariance[np.ix_(place, place)]))
+    if share is not None:
+        place, matrix = share
+        used = float(np.sum(matrix * covariance[np.ix_(place, place)]))
     total = float(np.sum(part.weight[:, None] * part.whitened**2))
     kept = part.weight > 0
     raw = part.residual

@@ -135,17 +135,22 @@ def attitude_curves(
 def _plausible(time: np.ndarray, quaternion: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, float]:
     """Mask of the samples that most of their neighbours can be reached from, and the typical rate (rad/s)."""
     n = len(time)
-    rotation = Rotation.from_quat(quaternion, scalar_first=True)
     step = float(np.median(np.diff(time)))
+
+    def turns(shift: int) -> np.ndarray:
+        """Angles between samples ``shift`` apart, right to 1e-8 rad."""
+        cosine = np.abs(np.einsum("ni,ni->n", quaternion[shift:], quaternion[:-shift]))
+        return np.asarray(2.0 * np.arccos(np.minimum(cosine, 1.0)))
+
     lag = min(max(1, int(np.ceil(2.0 / step))), n - 1)
     noise = float(np.median(np.linalg.norm(sigma, axis=1)))
-    far = (rotation[lag:] * rotation[:-lag].inv()).magnitude() / (time[lag:] - time[:-lag])
-    near = np.median((rotation[1:] * rotation[:-1].inv()).magnitude() / np.diff(time))
+    far = turns(lag) / (time[lag:] - time[:-lag])
+    near = np.median(turns(1) / np.diff(time))
     # Outliers raise a difference as often as twice their share, so that the 75 % quantile is still clean.
     rate = min(float(np.quantile(far, 0.75)), 4 * float(near))
     votes, good = np.zeros(n), np.zeros(n)
     for shift in range(1, min(4, n)):
-        angle = (rotation[shift:] * rotation[:-shift].inv()).magnitude()
+        angle = turns(shift)
         fine = angle < 4 * rate * (time[shift:] - time[:-shift]) + 15 * noise
         for part in (slice(None, n - shift), slice(shift, None)):
             votes[part] += 1

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 
@@ -37,6 +36,7 @@ from estimator.stretched_block import (
 from estimator.trajectory_residual import TrajectoryResidual, felt_directions, trajectory_unknown
 from estimator.unknowns import UnitQuaternion, Unknown, Vector
 from problems.alignment.attitude_at_epochs import AttitudeAtEpochs, attitude_at_epochs
+from problems.alignment.attitude_curve import AttitudeCurve, attitude_curves
 from problems.alignment.campaign import Arc, Campaign
 from problems.alignment.kernels import (
     ACTUATOR,
@@ -289,6 +289,26 @@ class AlignmentModel:
                       (float(min(campaign.gnss.time[0], time[0])), float(max(campaign.gnss.time[-1], time[-1]))),
                       period, (float(time[0]), float(time[-1])), directions)
 
+    @cached_property
+    def _curves(self) -> list[AttitudeCurve]:
+        tracker, torque = self.campaign.star_tracker, self.campaign.torque
+        edges = () if torque is None else tuple(np.concatenate([torque.start, torque.stop]).tolist())
+        sigma = np.broadcast_to(tracker.standard_deviation, (len(tracker.time), 3))
+        return attitude_curves(tracker.time, tracker.quaternion, sigma, edges)
+
+    def smooth_rate(self, time: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
+        """Angular rate (n, 3), rad/s, tracker axes, from smoothed attitude; ``otherwise`` where there is no curve.
+
+        A rate differenced from single samples carries their noise, which stands in the residual of the same epoch
+        too: an effect that depends on the rate would then seem present where there is none.
+        """
+        rate = np.array(otherwise, dtype=float)
+        for curve in self._curves:
+            inside = (time >= curve.start - 1e-6) & (time <= curve.stop + 1e-6)
+            if inside.any():
+                rate[inside] = curve.rate(np.clip(time[inside], curve.start, curve.stop))
+        return rate
+
     def environment(self, time: np.ndarray) -> np.ndarray:
         """Table (n, rows) of everything about the environment that an effect may depend on, along the orbit."""
         from scipy.spatial.transform import Rotation
@@ -482,7 +502,8 @@ def _positions(model: AlignmentModel, effects: tuple[EffectInstance, ...]) -> Tr
         tracker = model.campaign.star_tracker
         try:
             attitude = attitude_at_epochs(tracker, gnss.time)
-            quaternion, rate, inside = attitude.quaternion, attitude.rate, attitude.covered.astype(float)
+            quaternion, inside = attitude.quaternion, attitude.covered.astype(float)
+            rate = model.smooth_rate(gnss.time, attitude.rate)
         except ValueError:
             quaternion = np.tile([1.0, 0.0, 0.0, 0.0], (len(gnss.time), 1))
             rate, inside = np.zeros((len(gnss.time), 3)), np.zeros(len(gnss.time))
@@ -516,7 +537,7 @@ def _doppler(model: AlignmentModel, effects: tuple[EffectInstance, ...],
     }
     if "environment" in kernel.labels:
         data["environment"] = model.environment(time)
-        data["rate"] = attitude.rate[index]
+        data["rate"] = model.smooth_rate(time, attitude.rate[index])
     arc, names = model.session_of_epoch
     sigma = np.broadcast_to(doppler.standard_deviation, doppler.frequency_shift.shape)[index]
     return KernelResidual(
@@ -574,16 +595,14 @@ def _rotation(model: AlignmentModel, arc: Arc, index: np.ndarray,
 def _nodes(start: float, samples: np.ndarray, switches: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
     """Integration nodes: the start, every sample, every switch of the torque, and no step longer than ``longest``."""
     required = np.unique(np.concatenate([[start], samples, switches]))
-    merged = [required[0]]
-    for t in required[1:]:
-        if t - merged[-1] > 1e-9:
-            merged.append(t)
-    required = np.array(merged)
-    pieces = [required[:1]]
-    for a, b in pairwise(required):
-        steps = int(np.ceil((b - a) / longest - 1e-9))
-        pieces.append(a + (b - a) * np.arange(1, steps + 1) / steps)
-    nodes = np.concatenate(pieces)
+    while (close := np.flatnonzero(np.diff(required) <= 1e-9)).size:
+        required = np.delete(required, close[:1] + 1 if np.any(np.diff(close) == 1) else close + 1)
+    width = np.diff(required)
+    steps = np.ceil(width / longest - 1e-9).astype(int)
+    within = np.arange(int(steps.sum())) - np.repeat(np.cumsum(steps) - steps, steps) + 1
+    nodes = np.repeat(required[:-1], steps) + np.repeat(width / steps, steps) * within
+    nodes[np.cumsum(steps) - 1] = required[1:]
+    nodes = np.concatenate([required[:1], nodes])
     index = np.searchsorted(nodes, samples - 1e-9)
     return nodes, np.minimum(index, len(nodes) - 1)
 

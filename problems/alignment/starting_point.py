@@ -789,14 +789,22 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Cross products along the last axis; several times faster than NumPy's own on a handful of vectors."""
     x, y, z = a[..., 0], a[..., 1], a[..., 2]
     u, v, w = b[..., 0], b[..., 1], b[..., 2]
-    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)
+    result = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    np.subtract(y * w, z * v, out=result[..., 0])
+    np.subtract(z * u, x * w, out=result[..., 1])
+    np.subtract(x * v, y * u, out=result[..., 2])
+    return result
 
 
 def _attitude_slope(q: np.ndarray, w: np.ndarray) -> np.ndarray:
     """``q' = -w o q / 2`` along the last axis."""
     slope = np.empty(np.broadcast_shapes(q.shape, (*w.shape[:-1], 4)))
-    slope[..., 0] = 0.5 * np.sum(w * q[..., 1:], axis=-1)
-    slope[..., 1:] = -0.5 * (q[..., :1] * w + _cross(w, q[..., 1:]))
+    a, b, c, d = (0.5 * q[..., i] for i in range(4))
+    x, y, z = w[..., 0], w[..., 1], w[..., 2]
+    slope[..., 0] = x * b + y * c + z * d
+    slope[..., 1] = z * c - a * x - y * d
+    slope[..., 2] = x * d - a * y - z * b
+    slope[..., 3] = y * b - a * z - x * c
     return slope
 
 
