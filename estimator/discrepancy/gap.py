@@ -21,7 +21,7 @@ from estimator.residuals import KernelResidual, Linearization
 from estimator.trajectory_residual import TrajectoryResidual
 
 SMOOTH = 6  # Legendre polynomials per arc and component
-LEVEL = 0.01  # probability of a gap where there is none, over all places together
+LEVEL = 0.002  # probability of a gap where there is none, over all places together
 
 
 @dataclass(frozen=True)

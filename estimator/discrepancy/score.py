@@ -164,6 +164,7 @@ def signature(stacked: Stack, problem: Problem, parts: Sequence[Linearization], 
     """
     ordinary = np.array([i for i, p in enumerate(effect.parameters) if p.search is None], dtype=int)
     unknown = problem.unknown(effect.name)
+    typical = np.array([p.scale for p in effect.parameters]) / unknown.scales
     columns = np.zeros((len(stacked.residual), len(effect.parameters)))
     for residual, part in zip(problem.residuals, parts, strict=True):
         if all(u.name != effect.name for u in residual.unknowns) or residual.name not in stacked.blocks:
@@ -171,7 +172,7 @@ def signature(stacked: Stack, problem: Problem, parts: Sequence[Linearization], 
         rows = stacked.blocks[residual.name]
         _, block = rows_of(part, (unknown,), stacked.scale[residual.name] if stacked.jacobian.size else 1.0)
         if rows.stop - rows.start == len(block):
-            columns[rows] = block
+            columns[rows] = block * typical
     return Signature(effect, setting, ordinary, columns[:, ordinary], stacked.blocks)
 
 

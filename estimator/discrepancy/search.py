@@ -28,7 +28,7 @@ from estimator.residuals import Linearization
 from estimator.solvers.gauss_newton import Options, solve
 from estimator.solvers.summary import summarized
 
-SIGNIFICANT = 0.01  # probability of a name where there is nothing, after the search
+SIGNIFICANT = 0.005  # probability of a name where there is nothing, after the search
 SHORTLIST = 6  # candidates that are refitted jointly
 MOST_EFFECTS = 6
 INDISTINGUISHABLE = 4.6  # log odds (100 to 1) below which two names explain the data equally well
@@ -410,8 +410,7 @@ class Workflow:
 
     def _pays(self, before: Sequence[str], after: Sequence[str], name: str) -> bool:
         first, second = self.fit(before).estimate, self.fit(after).estimate
-        return pays(misfit(first.problem, first.parts, held_out=True),
-                    misfit(second.problem, second.parts, held_out=True), channels_of(second.problem, name))
+        return pays(first.problem, first.parts, second.problem, second.parts, channels_of(second.problem, name))
 
     def _findings(self, order: tuple[str, ...], p_values: Mapping[str, float]) -> tuple[Finding, ...]:
         findings = []

@@ -26,7 +26,7 @@ class AttitudeAtEpochs:
     Attributes:
         quaternion: (n, 4) ``tracker_from_inertial``.
         standard_deviation: (n, 3) rad about the tracker axes.
-        rate: (n, 3) rad/s, tracker axes, from neighbouring samples (for effects alone; noisy).
+        rate: (n, 3) rad/s, tracker axes, from neighbouring samples (noisy; where no smoothed curve exists).
         covered: (n,) False where the tracker has no data near the epoch.
     """
 

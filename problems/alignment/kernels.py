@@ -34,10 +34,14 @@ def inertia_trace_unknown(nominal: float) -> Unknown:
 
 
 def effect_unknown(effect: EffectInstance) -> Unknown:
-    """The parameters of an effect as one vector unknown."""
+    """The parameters of an effect as one vector unknown.
+
+    Its yardstick of observability is the plausible range, not the typical size: an effect that is known worse than its
+    typical size may still turn out large.
+    """
+    width = tuple(max(p.scale, 0.5 * (p.plausible[1] - p.plausible[0])) for p in effect.parameters)
     return Unknown(effect.name, Vector(len(effect.parameters), tuple(p.name for p in effect.parameters)),
-                   effect.parameters[0].unit, tuple(p.scale for p in effect.parameters),
-                   description=f"parameters of the effect {effect.name}")
+                   effect.parameters[0].unit, width, description=f"parameters of the effect {effect.name}")
 
 
 def environment_fields(rows: ca.SX) -> dict[str, ca.SX]:
