@@ -115,12 +115,12 @@ def instances(layout: OrbitLayout) -> tuple[OrbitEffect, ...]:
         found.append(OrbitEffect(name, name.split(":")[0], "force", parameters, acceleration, zero=zero,
                                  reference=reference))
 
-    three = axes("acceleration", "m/s2", 1e-6, 1e-3)
+    three = axes("acceleration", "m/s2", 1e-5, 1e-3)
     if not layout.acceleration_estimated:
         rates = axes("rate", "m/s3", 1e-10, 1e-7)
         force("constant-acceleration", three, constant_acceleration("constant-acceleration"),
               "acceleration = 0", "leak or outgassing of a satellite that keeps its attitude against the stars")
-        force("constant-acceleration:orbital", axes("acceleration", "m/s2", 1e-6, 1e-3, ("radial", "along", "cross")),
+        force("constant-acceleration:orbital", axes("acceleration", "m/s2", 1e-5, 1e-3, ("radial", "along", "cross")),
               constant_acceleration("constant-acceleration:orbital", orbital=True), "acceleration = 0",
               "leak or outgassing of a satellite that keeps its attitude against the Earth")
         force("constant-acceleration:linear", (*three, *rates),
