@@ -150,7 +150,7 @@ class KernelResidual:
         arc: (n,) index of the arc of each sample, into ``arc_names``.
         loss: robust loss.
         accepted: (n,) False for rejected samples, which keep their place and lose their weight.
-        factor: (n, m, m) inverse Cholesky factor of the covariance, or None before :meth:`prepared`.
+        factor: (n, m, m) inverse symmetric root of the covariance, or None before :meth:`prepared`.
     """
 
     name: str
@@ -197,7 +197,10 @@ class KernelResidual:
         for label, sigma in self.noise.items():
             spread = jacobians[label] * sigma[:, None, :]
             covariance += spread @ spread.transpose(0, 2, 1)
-        return np.linalg.inv(np.linalg.cholesky(covariance))
+        # The symmetric root keeps each component of the whitened residual closest to the component it came from, so
+        # that structure in one beam shows in that beam.
+        eigenvalues, vectors = np.linalg.eigh(covariance)
+        return (vectors / np.sqrt(eigenvalues)[:, None, :]) @ vectors.transpose(0, 2, 1)
 
     def prepared(self, values: Values) -> KernelResidual:
         if not self.noise:

@@ -184,7 +184,12 @@ def _marked(residual: TrajectoryResidual, used: np.ndarray) -> list[tuple[str, n
 
 def _place(channel: str, unit: str, cells: list[_Cell], everything: list[_Cell], tests: int) -> Place:
     arcs = tuple(dict.fromkeys(c.arc for c in cells))
-    components = tuple(sorted({c.component for c in cells}))
+    power: dict[int, float] = {}
+    for c in cells:
+        power[c.component] = power.get(c.component, 0.0) + max(c.smooth_power - c.degrees, 0.0)
+    # Noise common to all components leaves a trace of one component's structure in the others.
+    components = tuple(sorted(k for k, v in power.items() if v >= 0.5 * max(power.values())))
+    cells = [c for c in cells if c.component in components]
     samples = sum(c.samples for c in cells)
     floor = float(np.sqrt(sum(c.samples * c.floor**2 for c in cells) / samples))
     excess = float(np.sqrt(sum(max(c.smooth_power - c.degrees, 0.0) * c.floor**2 for c in cells) / samples))
