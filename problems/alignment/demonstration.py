@@ -339,7 +339,7 @@ def _result(solution: AlignmentSolution, comparison: Comparison, trajectory: tup
     answer = solution.as_dict()
     return {
         "status": status,
-        "why": ". ".join(why),
+        "why": "; ".join(why),
         "quantities": [
             {"name": q.name, "unit": q.unit, "cramer_rao_sigma": q.bound,
              **{key: {"error": q.errors[key], "error_over_sigma": q.ratio(key)} for key in METHODS}}
