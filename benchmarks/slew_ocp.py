@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -96,7 +97,8 @@ def percentiles(values: list[float]) -> dict[str, float]:
 def random_study(count: int, solver: str = "ipopt") -> dict[str, Any]:
     """Solve ``count`` random slews, half of them with the jerk limit four times looser."""
     random = np.random.default_rng(20250621)
-    wall, own, excess, attitude, over5, failures, replans = [], [], [], [], [], [], []
+    wall, own, excess, attitude, over5, failures, replans, warm = [], [], [], [], [], [], [], []
+    load = [os.getloadavg()[0]]
     for i in range(count):
         request = replace(random_slew(random, 4.0 if i % 2 else 1.0), solver=solver)
         t0, w0 = time.process_time(), time.perf_counter()
@@ -121,11 +123,14 @@ def random_study(count: int, solver: str = "ipopt") -> dict[str, Any]:
             optimal_slew(near)
             t1 = time.process_time()
             optimal_slew(near, near=optimum)
-            replans.append((time.process_time() - t1) / (t1 - t0))
-    return {"count": count, "solver": solver, "solved": len(own), "failures": failures, "process_s": percentiles(own),
+            warm.append(time.process_time() - t1)
+            replans.append(warm[-1] / (t1 - t0))
+    load.append(os.getloadavg()[0])
+    return {"count": count, "load_average_of_the_machine": load, "processors": os.cpu_count(), "solver": solver, "solved": len(own), "failures": failures, "process_s": percentiles(own),
             "wall_s": percentiles(wall), "largest_excess": float(max(excess)),
             "largest_terminal_error_arcsec": float(max(attitude)),
-            "mrp5_over_optimum": percentiles(over5), "replan_over_cold": percentiles(replans)}
+            "mrp5_over_optimum": percentiles(over5), "replan_over_cold": percentiles(replans),
+            "replan_process_s": percentiles(warm)}
 
 
 def reference_study(count: int) -> list[dict[str, Any]]:
@@ -270,38 +275,43 @@ def dymos_seconds(request: SlewRequest, segments: int) -> tuple[float, float]:
     problem.run_model()
     begun = time.process_time()
     dm.run_problem(problem, run_driver=True, simulate=False, make_plots=False)
-    return time.process_time() - begun, float(problem.get_val("trajectory.phase.timeseries.time")[-1, 0])
+    seconds = time.process_time() - begun
+    if not problem.driver.result.success:
+        raise RuntimeError(f"SLSQP did not converge in {seconds:.2f} s")
+    return seconds, float(problem.get_val("trajectory.phase.timeseries.time")[-1, 0])
 
 
 def rival_study(count: int) -> dict[str, Any]:
-    """The same slews in rockit and dymos where they are installed, in the same process."""
+    """The same slews in rockit and dymos where they are installed, in the same process, one right after the other."""
     random = np.random.default_rng(11)
     requests = [random_slew(random, 1.0) for _ in range(count)]
-    own = []
-    for request in requests:
-        begun = time.process_time()
-        optimum = optimal_slew(request)
-        own.append((time.process_time() - begun, optimum.duration))
-    result: dict[str, Any] = {"own": percentiles([t for t, _ in own])}
-    for name, solve, size, most in (("rockit", rockit_seconds, 60, count), ("dymos", dymos_seconds, 10, min(count, 3))):
-        times, ratios, failed = [], [], 0
+    for request in requests:  # makes the solvers of every mesh
+        optimal_slew(request)
+    result: dict[str, Any] = {"slews": count}
+    for name, solve, size, most in (("rockit", rockit_seconds, 60, count), ("dymos", dymos_seconds, 10, min(count, 5))):
         try:
             __import__(name)
         except ImportError:
             result[name] = "not installed"
             continue
-        for request, (seconds, duration) in list(zip(requests, own, strict=True))[:most]:
+        own, rival, ratios, durations, failed = [], [], [], [], []
+        for request in requests[:most]:
+            begun = time.process_time()
+            optimum = optimal_slew(request)
+            seconds = time.process_time() - begun
             try:
                 rival_seconds, rival_duration = solve(request, size)
             except Exception as error:
-                failed += 1
-                result[f"{name}_error"] = f"{type(error).__name__}: {error}"[:300]
+                failed.append(f"{type(error).__name__}: {error}"[:200])
                 continue
-            times.append(rival_seconds / seconds)
-            ratios.append(rival_duration / duration)
-        result[name] = {"failed": failed, "compared": len(times)}
-        if times:
-            result[name] |= {"time_over_own": percentiles(times), "duration_over_own": percentiles(ratios)}
+            own.append(seconds)
+            rival.append(rival_seconds)
+            ratios.append(rival_seconds / seconds)
+            durations.append(rival_duration / optimum.duration)
+        result[name] = {"intervals": size, "asked": most, "compared": len(own), "failed": failed}
+        if own:
+            result[name] |= {"own_s": percentiles(own), "rival_s": percentiles(rival),
+                             "time_over_own": percentiles(ratios), "duration_over_own": percentiles(durations)}
     return result
 
 

@@ -284,6 +284,11 @@ class Transcription:
             if name == "ipopt":
                 settings |= {"ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-8, "ipopt.max_iter": 250,
                              "ipopt.nlp_scaling_method": "none"}
+                if not self.extras.rows:
+                    # The unknowns are scaled and the pattern is a narrow band: nothing is gained by scaling, matching
+                    # and ordering again in the linear solver, or by refining its steps; it costs a sixth of the time.
+                    settings |= {"ipopt.mumps_scaling": 0, "ipopt.mumps_permuting_scaling": 0,
+                                 "ipopt.mumps_pivot_order": 0, "ipopt.fast_step_computation": "yes"}
             else:
                 n, extra = self.count, self.height - STATE
                 settings |= {"structure_detection": "manual", "N": n, "nx": [STATE] * (n + 1),
