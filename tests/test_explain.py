@@ -90,7 +90,8 @@ def test_too_small_a_declared_noise_is_not_an_effect() -> None:
     assert answer["effects"] == []
     assert answer["verdict"] == "unknown" and "noise" in answer["why"]
     assert [w["residual"] for w in answer["white_noise"]] == ["doppler"]
-    assert answer["white_noise"][0]["factor"] == pytest.approx(1.6, rel=0.15)
+    # The tracker's noise, which is as declared, has its share in every beam: less than 1.6 of the whole.
+    assert 1.1 < answer["white_noise"][0]["factor"] < 1.7
 
 
 def test_an_effect_that_the_library_does_not_hold_stays_unknown() -> None:
@@ -109,7 +110,7 @@ def test_an_effect_that_the_library_does_not_hold_stays_unknown() -> None:
 
 
 def test_without_its_name_in_the_library_an_effect_is_unknown_not_something_else() -> None:
-    """A lever arm shows in the positions inside the arcs; without it no candidate touches that."""
+    """A lever arm shows in the positions inside the arcs; no other candidate touches that."""
     explanation = explained(compact(14, {"gnss-lever-arm": [9.0, -7.0, 8.0]}),
                             without=(*HEAVY, "tracker-frame-jump", "gnss-lever-arm"))
     answer = answer_of(explanation)

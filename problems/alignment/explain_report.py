@@ -434,8 +434,9 @@ def _finding_block(explanation: Explanation, finding: Finding, before: Sequence[
     block.append("</p>")
     if items:
         block.append(f"<figure>{finding_figure(items, held_out)}<figcaption>Dots: samples. Lines: means over short "
-                     "stretches. Errors that all beams share are weighted down as in the fit. The signature is "
-                     "what the effect changed after everything else was refitted. Right: samples that no fit used, in the component that the effect changes most.</figcaption></figure>")
+                     "stretches. Errors that all beams share are weighted down as in the fit. The signature is what "
+                     "the effect changed after everything else was refitted. Right: samples that no fit used, in the "
+                     "component that the effect changes most.</figcaption></figure>")
     fitted = parameters_of(final, effect)
     rows = []
     for i, p in enumerate(effect.parameters):
