@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,25 @@ def _row(system: BookSystem, simulated: Simulated, run: FilterRun, seconds: floa
             "runs": len(error), "seconds": seconds}
 
 
+def _works(system: BookSystem, simulated: Simulated) -> dict[str, Callable[[], FilterRun]]:
+    """Every filter on one set of realizations, by name."""
+    case, z = system.case, simulated.measurements
+    start, covariance = case.first_state, np.diag(case.prior**2)
+    nominal, matrices = system.stationary_motion()
+    others = range(6, SIZE)
+    return {
+        "linear": lambda: linear_filter(system, nominal, matrices, start, covariance, z),
+        "extended": lambda: extended_filter(system, start, covariance, z),
+        "inflated": lambda: extended_filter(BookSystem(case, 1e-8), start, covariance, z),
+        "iterated": lambda: extended_filter(system, start, covariance, z, iterations=4),
+        "square-root": lambda: square_root_filter(system, start, covariance, z, iterations=4),
+        "schmidt": lambda: schmidt_filter(system, start, covariance, z, others),
+        "schmidt-iterated": lambda: schmidt_filter(system, start, covariance, z, others, iterations=4),
+        "unscented": lambda: unscented_filter(system, start, covariance, z),
+        "smoother": lambda: iterated_smoother(system, start, covariance, z),
+    }
+
+
 def filters(runs: int, step: float, seed: int) -> list[dict[str, Any]]:
     """Every filter for each first deviation and with and without a burn."""
     rows = []
@@ -44,20 +64,7 @@ def filters(runs: int, step: float, seed: int) -> list[dict[str, Any]]:
                 case = BookCase(step=step, burn=burn, stationary=stationary)
                 system = BookSystem(case)
                 simulated = simulate(system, runs, seed, deviation=deviation, kind="exact")
-                start, covariance = case.first_state, np.diag(case.prior**2)
-                nominal, matrices = system.stationary_motion()
-                z = simulated.measurements
-                tried = {
-                    "linear": lambda: linear_filter(system, nominal, matrices, start, covariance, z),
-                    "extended": lambda: extended_filter(system, start, covariance, z),
-                    "inflated": lambda: extended_filter(BookSystem(case, 1e-8), start, covariance, z),
-                    "iterated": lambda: extended_filter(system, start, covariance, z, iterations=4),
-                    "square-root": lambda: square_root_filter(system, start, covariance, z, iterations=4),
-                    "schmidt": lambda: schmidt_filter(system, start, covariance, z, range(6, SIZE)),
-                    "schmidt-iterated": lambda: schmidt_filter(system, start, covariance, z, range(6, SIZE), iterations=4),
-                    "unscented": lambda: unscented_filter(system, start, covariance, z),
-                    "smoother": lambda: iterated_smoother(system, start, covariance, z),
-                }
+                tried = _works(system, simulated)
                 for name, work in tried.items():
                     began = time.perf_counter()
                     row = _row(system, simulated, work(), time.perf_counter() - began)
@@ -82,9 +89,11 @@ def bound(runs: int, step: float, seed: int) -> dict[str, Any]:
         limit = batch_bound(system, simulated.truth[r, 0])
         ratios.append(error**2 / np.diag(limit))
         scale = case.prior
-        squares.append(float(error / scale @ np.linalg.solve(estimate.covariance / np.outer(scale, scale), error / scale)))
+        inner = estimate.covariance / np.outer(scale, scale)
+        squares.append(float(error / scale @ np.linalg.solve(inner, error / scale)))
     return {"runs": runs, "ratio": float(np.sqrt(np.mean(ratios))),
-            "ratio_per_component": np.sqrt(np.mean(ratios, axis=0)).tolist(), "nees_over_size": float(np.mean(squares)) / SIZE,
+            "ratio_per_component": np.sqrt(np.mean(ratios, axis=0)).tolist(),
+            "nees_over_size": float(np.mean(squares)) / SIZE,
             "nees_sigma": float(np.sqrt(2 / (SIZE * runs)))}
 
 

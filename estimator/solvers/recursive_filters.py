@@ -249,7 +249,7 @@ def square_root_filter(system: DiscreteSystem, state: np.ndarray, covariance: np
             pre[:, :outputs, :outputs] = noise_root.T
             pre[:, outputs:, :outputs] = np.swapaxes(h @ root, -1, -2)
             pre[:, outputs:, outputs:] = np.swapaxes(root, -1, -2)
-            post = np.linalg.qr(pre, mode="r")
+            post: np.ndarray = np.asarray(np.linalg.qr(pre, mode="r"))
             s_root, cross = np.swapaxes(post[:, :outputs, :outputs], -1, -2), np.swapaxes(post[:, :outputs, outputs:], -1,
                                                                                          -2)
             innovation = measurements[:, k] - predicted - np.einsum("rij,rj->ri", h, x - point)

@@ -129,7 +129,7 @@ def measurement(x: Matrix, greenwich: Matrix) -> Matrix:
     antenna = Antenna(place, axes, x[9])
     how = Signalling("reception", "sum", troposphere=False, bending=False)
     none = Corrections()
-    values = [predicted(kind, state, earth, antenna, antenna, how, none, same=True)  # type: ignore[arg-type]
+    values = [predicted(kind, state, earth, antenna, antenna, how, none, same=True)
               for kind in ("range", "range_rate", "direction_cosines")]
     return ca.vertcat(*values) + x[10:14]
 

@@ -96,7 +96,7 @@ _MEASUREMENTS: tuple[tuple[str, str, tuple[str, ...], tuple[Parameter, ...], boo
      "orientation of a mount"),
     ("range-scale-error", "range_scale", ("range",), (Parameter("scale", "1", 1e-6, (-1e-4, 1e-4)),), False,
      "a wrong constant or rate of a clock multiplies every range"),
-    ("station-position-error", "station", _ALL, axes("offset", "m", 30.0, 3000.0, ("east", "north", "up")), True,
+    ("station-position-error", "station", _ALL, axes("offset", "m", 300.0, 3000.0, ("east", "north", "up")), True,
      "survey of the antenna"),
     ("timetag-offset", "time_tag", _ALL, (Parameter("offset", "s", 0.01, (-100.0, 100.0)),), True, "clock of a station"),
     ("tropospheric-delay", "zenith_troposphere", ("range",), (Parameter("zenith_delay", "m", 0.3, (-1.0, 4.0)),), True,

@@ -62,7 +62,7 @@ def state_of_elements(lines: tuple[str, str], epoch: np.datetime64) -> tuple[np.
     year, month, day = (int(w) for w in date.split("-"))
     hour, minute, second = clock.split(":")
     instant = brahe.Epoch.from_datetime(year, month, day, int(hour), int(minute), float(second), 0.0,
-                                        brahe.TimeSystem.TAI)
+                                        brahe.TimeSystem.TAI)  # type: ignore[arg-type]
     teme = np.asarray(propagator.state(instant))
     days = float((epoch - np.datetime64("2000-01-01T12:00:00", "us")) / np.timedelta64(1, "us")) / 86400e6
     tt = days + 32.184 / 86400  # day

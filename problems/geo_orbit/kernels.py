@@ -14,9 +14,9 @@ import numpy as np
 
 from estimator.models.light_time import Earth
 from estimator.models.orbit_environment import SpaceEnvironment
-from estimator.orbit_signal import STATE
 from estimator.models.ranging import SIZES, Antenna, Corrections, Kind, Signalling, difference, predicted
 from estimator.models.station import east_north_up, station_position
+from estimator.orbit_signal import STATE
 from estimator.residuals import Kernel
 from estimator.unknowns import Unknown
 from problems.geo_orbit.tracking import Station
@@ -58,8 +58,8 @@ def measurement_kernel(kind: Kind, signalling: Signalling, same: bool, correctin
             before = getattr(corrections, c.field)
             setattr(corrections, c.field, value if before is None else before + value)
         earth = Earth(seen["intermediate"], seen["angle"], seen["pole"])
-        antennas = [Antenna(seen[n], seen[f"{n}_axes"], seen[f"{n}_altitude"]) for n in ("transmitter", "receiver")]
-        value = predicted(kind, seen["state"], earth, *antennas, signalling, corrections, same=same)
+        sender, receptor = (Antenna(seen[n], seen[f"{n}_axes"], seen[f"{n}_altitude"]) for n in ("transmitter", "receiver"))
+        value = predicted(kind, seen["state"], earth, sender, receptor, signalling, corrections, same=same)
         return difference(kind, seen["measured"], value)
 
     kernel = Kernel(f"orbit_{kind}", [c.unknown for c in correcting], [("state", STATE)],

@@ -6,7 +6,7 @@ problem: ``position`` and ``velocity`` at the epoch, force parameters, velocity 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -29,8 +29,8 @@ from estimator.models.orbit_motion import (
     motion,
     motion_inputs,
 )
-from estimator.orbit_signal import OrbitArc, OrbitSignal, VelocityStep, position_unknown, velocity_unknown
 from estimator.models.ranging import COMPONENTS, UNITS, Signalling
+from estimator.orbit_signal import OrbitArc, OrbitSignal, VelocityStep, position_unknown, velocity_unknown
 from estimator.problem import Problem
 from estimator.residuals import KernelResidual, Residual
 from estimator.unknowns import Unknown, Vector
@@ -294,7 +294,7 @@ def orbit_problem(model: OrbitModel, effects: Sequence[str] = (), *, candidates:
 
 
 def _residual(model: OrbitModel, arc: OrbitArc, o: Observations, effects: Sequence[OrbitEffect],
-              need) -> KernelResidual:  # type: ignore[no-untyped-def]
+              need: Callable[[Unknown, np.ndarray], Unknown]) -> KernelResidual:
     s = model.settings
     receiver, transmitter = model.station(o.receiver), model.station(o.transmitter)
     same = o.receiver == o.transmitter

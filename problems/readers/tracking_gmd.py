@@ -46,11 +46,11 @@ def read_gmd(path: Path) -> Tracking:
                               value=", ".join(sorted(satellites)), remedy="split it by satellite")
     observations = []
     for (station, _), entries in rows.items():
-        day = np.array([e[0] for e in entries])
-        mjd = day + _MJD_LESS if np.median(day) < _SPAN[0] else day
+        days = np.array([e[0] for e in entries])
+        mjd = days + _MJD_LESS if np.median(days) < _SPAN[0] else days
         if mjd.min() < _SPAN[0] or mjd.max() > _SPAN[1]:
             raise FileFormatError("this day count is no modified Julian date (less 30000)", where=str(path),
-                                  value=f"{day.min():.3f} to {day.max():.3f}", limit=f"{_SPAN[0]:.0f} to {_SPAN[1]:.0f}")
+                                  value=f"{days.min():.3f} to {days.max():.3f}", limit=f"{_SPAN[0]:.0f} to {_SPAN[1]:.0f}")
         order = np.argsort(mjd, kind="stable")
         observations.append(Observations("range", station, station, tai_from_mjd(mjd)[order],
                                          1e3 * np.array([[e[1]] for e in entries])[order], path.name,
