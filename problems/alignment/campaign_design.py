@@ -106,21 +106,63 @@ def efficiency(criterion: Criterion, information: np.ndarray, reference: np.ndar
     return theirs / ours
 
 
-def _value_and_slope(criterion: Criterion, matrix: np.ndarray) -> tuple[float, np.ndarray]:
-    """The smooth criterion (not its logarithm for A and E) and minus its derivative along the information."""
-    if criterion == "D":
-        inverse = np.linalg.inv(matrix)
-        return float(-np.linalg.slogdet(matrix)[1]), inverse
-    inverse = np.linalg.inv(matrix)
+def _value_and_slope(criterion: Criterion, matrix: np.ndarray, interest: np.ndarray) -> tuple[float, np.ndarray]:
+    """The smooth criterion (not its logarithm for A and E) of ``interest`` and minus its derivative along the information."""
+    reach = np.linalg.solve(matrix, interest.T)
+    covariance = interest @ reach
+    covariance = 0.5 * (covariance + covariance.T)
     if criterion == "A":
-        return float(np.trace(inverse)), inverse @ inverse
-    values, vectors = np.linalg.eigh(inverse)
+        return float(np.trace(covariance)), reach @ reach.T
+    if criterion == "D":
+        return float(np.linalg.slogdet(covariance)[1]), reach @ np.linalg.solve(covariance, reach.T)
+    values, vectors = np.linalg.eigh(covariance)
     top = values[-1]
     relative = values / top
     total = float(np.sum(relative**EXPONENT))
-    value = top * total ** (1 / EXPONENT)
-    slope = top * top * total ** (1 / EXPONENT - 1) * (vectors * relative ** (EXPONENT + 1)) @ vectors.T
-    return float(value), slope
+    weight = (vectors * relative ** (EXPONENT - 1)) @ vectors.T
+    return float(top * total ** (1 / EXPONENT)), total ** (1 / EXPONENT - 1) * reach @ weight @ reach.T
+
+
+def information_about(interest: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """Information (m, m) about ``interest @ unknowns`` (m, n), all else unknown; zero where the matrix is singular."""
+    if not np.isfinite(criterion_value("D", information)):
+        return np.zeros((len(interest), len(interest)))
+    # Balanced by its diagonal: the units of the unknowns differ by orders of magnitude.
+    root = 1 / np.sqrt(np.diag(information))
+    inverse = np.linalg.inv(information * np.outer(root, root)) * np.outer(root, root)
+    about = np.linalg.inv(interest @ inverse @ interest.T)
+    return 0.5 * (about + about.T)
+
+
+def slope_of(criterion: Criterion, information: np.ndarray, interest: np.ndarray | None = None) -> np.ndarray:
+    """Minus the derivative (n, n) of the (smooth) criterion along the information (n, n): what more of it would bring."""
+    wanted = np.eye(len(information)) if interest is None else interest
+    return _value_and_slope(criterion, information, wanted)[1]
+
+
+def certified_bound(criterion: Criterion, information: np.ndarray, candidates: np.ndarray,
+                    prior: np.ndarray | None = None, interest: np.ndarray | None = None) -> float:
+    """What no shares of the candidates can go below: the tangent plane at one design, whichever it is.
+
+    Args:
+        criterion: A, D or E.
+        information: (n, n) of a design, prior included; the better the design, the closer the bound.
+        candidates, prior, interest: as for :func:`best_shares`.
+    """
+    stack = candidates[None] if candidates.ndim == 3 else candidates
+    known = np.zeros_like(information) if prior is None else prior
+    wanted = np.eye(len(information)) if interest is None else interest
+    value, slope = _value_and_slope(criterion, information, wanted)
+    if criterion == "E":
+        # The largest eigenvalue is at least any weighted mean of them: a criterion like A, with a tangent of its own.
+        covariance = np.linalg.inv(information_about(wanted, information))
+        values, vectors = np.linalg.eigh(covariance)
+        relative = (values / values[-1]) ** (EXPONENT - 1)
+        mean = (vectors * (relative / relative.sum())) @ vectors.T
+        reach = np.linalg.solve(information, wanted.T)
+        value, slope = float(np.sum(mean * covariance)), reach @ mean @ reach.T
+    gain = np.einsum("bkij,ij->bk", stack, slope)
+    return value + float(np.sum(slope * (information - known))) - float(np.mean(gain.max(axis=1)))
 
 
 @dataclass(frozen=True)
@@ -141,7 +183,7 @@ class Shares:
 
 
 def best_shares(candidates: np.ndarray, criterion: Criterion, prior: np.ndarray | None = None,
-                tolerance: float = 1e-3, iterations: int = 5000) -> Shares:
+                interest: np.ndarray | None = None, tolerance: float = 1e-3, iterations: int = 5000) -> Shares:
     """The shares of the candidates that make the criterion least, and the bound that proves it.
 
     Minimises the criterion of ``prior + sum_bk w_bk candidates_bk`` under ``w >= 0`` and ``sum_k w_bk = 1/b`` by the
@@ -153,6 +195,7 @@ def best_shares(candidates: np.ndarray, criterion: Criterion, prior: np.ndarray 
             shares of their own (parts of the time in which conditions differ).
         criterion: A, D or E.
         prior: (n, n) what is known already.
+        interest: (m, n) the combinations of the unknowns that the criterion is about; default: each unknown.
         tolerance: relative distance of value and bound at which to stop (for D: absolute over n).
         iterations: most steps; the bound holds wherever the iteration stops.
 
@@ -168,6 +211,7 @@ def best_shares(candidates: np.ndarray, criterion: Criterion, prior: np.ndarray 
                          value=f"shape {stack.shape}", limit="(k, n, n)")
     blocks, count, size, _ = stack.shape
     known = np.zeros((size, size)) if prior is None else np.asarray(prior, dtype=float)
+    wanted = np.eye(size) if interest is None else np.asarray(interest, dtype=float)
     flat = stack.reshape(blocks, count, size * size)
     weights = np.full((blocks, count), 1.0 / (blocks * count))
     matrix = known + np.einsum("bk,bkm->m", weights, flat).reshape(size, size)
@@ -177,15 +221,15 @@ def best_shares(candidates: np.ndarray, criterion: Criterion, prior: np.ndarray 
     bound = -np.inf
     for _ in range(iterations):
         matrix = known + np.einsum("bk,bkm->m", weights, flat).reshape(size, size)
-        value, slope = _value_and_slope(criterion, matrix)
+        value, slope = _value_and_slope(criterion, matrix, wanted)
         gain = flat @ slope.ravel()
         lowest = value + float(np.sum(slope * (matrix - known))) - float(np.mean(gain.max(axis=1)))
         bound = max(bound, lowest)
-        if value - bound <= tolerance * (size if criterion == "D" else abs(value)):
+        if value - bound <= tolerance * (len(wanted) if criterion == "D" else abs(value)):
             break
         grown = weights * np.sqrt(np.maximum(gain, 0.0))
         weights = grown / (blocks * grown.sum(axis=1, keepdims=True))
-    exact = criterion_value(criterion, matrix)
+    exact = criterion_value(criterion, information_about(wanted, matrix))
     if criterion == "E":
-        bound /= size ** (1 / EXPONENT)
+        bound = certified_bound("E", matrix, stack, known, wanted)
     return Shares(weights, matrix, exact, min(bound, exact))

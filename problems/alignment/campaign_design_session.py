@@ -28,7 +28,7 @@ from estimator.models.earth import GRAVITATIONAL_PARAMETER
 from estimator.models.errors import NotFiniteError, RequestError, ShapeError
 from estimator.models.inertia import inverse3
 from estimator.models.rotations import Matrix
-from problems.alignment.campaign_design import Criterion, best_shares, criterion_function, criterion_value
+from problems.alignment.campaign_design import Criterion, best_shares, certified_bound, criterion_function, criterion_value, slope_of
 from problems.alignment.kernels import doppler_kernel
 from problems.alignment.simulation.pointing import profile_spline
 from problems.alignment.simulation.scenario import Scenario
@@ -457,7 +457,7 @@ def _starts(request: SessionRequest, count: int, starts: int, seed: int) -> list
 def session_bound(request: SessionRequest, criterion: Criterion, grid: tuple[int, int, int] = (13, 7, 7)) -> float:
     """A criterion that no session within the same angles can go below, whatever its rates.
 
-    The session may share its epochs among all attitudes of the angles' box, in each ninth of its time as it likes: a convex
+    The session may share its epochs among all attitudes of the angles' box, in each third of its time as it likes: a convex
     problem whose value is a bound for every profile. The box is searched on a grid of that many angles per axis,
     and the tangent plane of the answer on one twice as fine, so the bound is exact but for the grid's step.
     """
@@ -477,13 +477,9 @@ def session_bound(request: SessionRequest, criterion: Criterion, grid: tuple[int
 
     coarse = informations(candidates(grid))
     first = best_shares(coarse, criterion, request.prior, tolerance=5e-3, iterations=2000)
-    # Those attitudes of the finer grid that the answer could use.
-    finer = candidates([2 * n - 1 for n in grid])
-    inverse = np.linalg.inv(first.information)
-    slope = {"A": inverse @ inverse, "D": inverse}.get(criterion)
-    if slope is None:
-        slope = np.linalg.matrix_power(inverse / np.linalg.norm(inverse, 2), 17)
-    fine = informations(finer)
-    gain = np.einsum("bkij,ij->bk", fine, slope).max(axis=0)
+    # Only those attitudes of the finer grid that the answer could use, the most promising ones.
+    fine = informations(candidates([2 * n - 1 for n in grid]))
+    gain = np.einsum("bkij,ij->bk", fine, slope_of(criterion, first.information)).max(axis=0)
     useful = gain >= np.sort(gain)[-min(len(gain), 400)]
-    return best_shares(fine[:, useful], criterion, request.prior, tolerance=1e-3, iterations=4000).bound
+    refined = best_shares(fine[:, useful], criterion, request.prior, tolerance=1e-3, iterations=4000)
+    return certified_bound(criterion, refined.information, fine, request.prior)
