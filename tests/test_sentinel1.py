@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import datetime
 from functools import lru_cache
 from pathlib import Path
@@ -40,6 +41,7 @@ from estimator.models.errors import (
 )
 from problems.alignment import commands_import
 from problems.alignment.campaign import Campaign
+from problems.alignment.determined_rotation import undetermined_axes
 from problems.alignment.sentinel1_import import (
     beam_directions,
     campaign_of,
@@ -48,7 +50,9 @@ from problems.alignment.sentinel1_import import (
     polynomial_value,
     slant_interval,
 )
-from problems.readers.campaign_file import read_campaign
+from problems.alignment.solution import solve_campaign
+from problems.cli import main
+from problems.readers.campaign_file import read_campaign, write_campaign
 from problems.readers.sentinel1_annotation import Annotation, read_annotation
 from problems.readers.sentinel1_orbit_file import read_orbit_file
 
@@ -292,6 +296,87 @@ def test_acquisitions_far_apart_become_arcs(make: Callable[..., Path]) -> None:
     assert [arc.kind for arc in campaign.arcs] == ["doppler", "doppler"]
     assert campaign.arcs[1].start - campaign.arcs[0].start == pytest.approx(400.0, abs=1e-3)
     assert np.abs(campaign.doppler.frequency_shift - predicted(campaign)).max() < 0.05
+
+
+def test_solve_gives_the_squint_and_names_the_turn_that_one_acquisition_leaves_open(
+    make: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A turn that is there in truth about the undetermined axis too: the estimate stays at the design value there."""
+    truth = np.array([1.5e-4, 2e-3, -9.0e-5])
+    paths = [
+        make(f"solve-{swath}", swath=swath, misalignment=tuple(truth), offset=offset, noise=3.0)
+        for swath, offset in (("IW1", 0.0), ("IW2", 0.9), ("IW3", 1.8))
+    ]
+    file = tmp_path / "scene.nc"
+    write_campaign(import_sentinel1(paths), file)
+    with pytest.raises(SystemExit) as stopped:
+        main(["solve", str(file), "--json"])
+    assert stopped.value.code == 1  # answered, and something asked for is not determined
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["status"] == "unobservable"
+    found = answer["antenna_from_tracker"]
+    turn = Rotation.from_quat(found["quaternion"], scalar_first=True).as_rotvec()
+    assert abs(turn[1]) < 1e-6  # rad, at the design value
+    assert found["sigma_rad"][1] is None and found["sigma_rad"][0] > 0 and found["sigma_rad"][2] > 0
+    assert sum("rotation of antenna_from_tracker about the antenna axis" in u for u in answer["unobservable"]) == 1
+    assert "rotation of antenna_from_tracker about the antenna axis" in answer["why"]
+    assert len(found["determined"]) == 2
+    for each in found["determined"]:
+        axis = np.array(each["axis"])
+        assert abs(axis[1]) < 1e-2 and np.linalg.norm(axis) == pytest.approx(1.0)
+        assert abs(each["angle_rad"] - axis @ truth) < 4 * each["sigma_rad"]
+        assert 0.01 < each["sigma_scatter_rad"] / each["sigma_rad"] < 3
+    best, squint_found = found["determined"][0], found["squint"]
+    assert best["sigma_rad"] < found["determined"][1]["sigma_rad"]
+    assert squint_found["angle_rad"] == pytest.approx(best["angle_rad"], abs=3e-6)
+    assert squint_found["sigma_rad"] == pytest.approx(best["sigma_rad"], rel=0.1)
+    assert 3e-6 < squint_found["sigma_rad"] < 2e-5  # 5 Hz a value over 81 values, and 4 Hz of attitude an epoch
+    assert "the squint of the beams is determined" in answer["why"]
+
+
+def test_acquisitions_years_apart_are_solved_together(make: Callable[..., Path]) -> None:
+    """Two and a half years apart, and a few minutes: three stretches, the mounting of all, and every row used."""
+    truth = (1.5e-4, 0.0, -9.0e-5)
+    starts = (-86400.0 * 900, -86400.0 * 900 + 1900.0, 0.0)
+    campaign = import_sentinel1(
+        [
+            make(f"years-{k}-{swath}", swath=swath, misalignment=truth, offset=start)
+            for k, start in enumerate(starts)
+            for swath in ("IW1", "IW3")
+        ]
+    )
+    solution = solve_campaign(campaign)
+    assert len(solution.model.stretches) == 3
+    assert len(solution.model.doppler_epochs) == len(campaign.doppler.time) == 54
+    assert not solution.model.left_out
+    residual = solution.as_dict()["residuals"]["doppler"]
+    assert residual["rms"] < 0.1  # Hz: nothing but the orbit's 10 s list and the fit of polynomials
+    turn = Rotation.from_quat(solution.antenna_from_tracker, scalar_first=True).as_rotvec()
+    assert np.abs(turn[[0, 2]] - [truth[0], truth[2]]).max() < 2e-6
+
+
+def test_the_start_keeps_the_design_value_where_the_data_are_silent(make: Callable[..., Path]) -> None:
+    """Also where the design is turned itself, and where the data contradict each other by many sigmas."""
+    paths = [
+        make("silent-early", misalignment=(3e-4, 0.0, 0.0)),
+        make("silent-late", misalignment=(-3e-4, 0.0, 2e-4), offset=3000.0),
+    ]
+    campaign = import_sentinel1(paths)
+    design = Rotation.from_rotvec([0.01, -0.02, 0.005])
+    turned = replace(
+        campaign,
+        nominal=replace(campaign.nominal, antenna_from_tracker=design.as_quat(scalar_first=True)),
+        doppler=replace(campaign.doppler, beam_direction=design.apply(
+            campaign.doppler.beam_direction.reshape(-1, 3)).reshape(campaign.doppler.beam_direction.shape)),
+    )
+    for case, nominal in ((campaign, Rotation.identity()), (turned, design)):
+        solution = solve_campaign(case)
+        assert solution.status == "model_gap"
+        axes = undetermined_axes(solution.estimate, "antenna_from_tracker")
+        assert axes.shape == (1, 3)
+        away = (Rotation.from_quat(solution.antenna_from_tracker, scalar_first=True) * nominal.inv()).as_rotvec()
+        assert abs(away @ axes[0]) < 1e-5
+        assert np.linalg.norm(away) < 2e-3
 
 
 def test_estimates_that_cannot_be_used_are_left_out(make: Callable[..., Path]) -> None:
@@ -545,6 +630,24 @@ def test_measured_squints_are_what_the_annotations_say(annotations: list[Annotat
     along = about_x * np.cos(middle) + about_z * np.sin(middle)
     assert along * 2 * CARRIER / LIGHT * speed == pytest.approx(difference, abs=1.0)
     assert 15 < abs(difference) < 30  # Hz
+
+
+@needs_data
+def test_every_measured_scene_together_is_solved(annotations: list[Annotation]) -> None:
+    """Eleven years in one campaign: a stretch an acquisition, the plain mounting does not explain them."""
+    campaign = campaign_of([a for a in annotations if a.mission == "S1A"])
+    solution = solve_campaign(campaign)
+    assert len(solution.model.doppler_epochs) == len(campaign.doppler.time) > 300
+    assert len(solution.model.stretches) >= 10
+    answer = solution.as_dict()
+    assert answer["status"] == "model_gap"
+    assert answer["residuals"]["gnss"]["rms"] < 0.1  # m
+    assert 10 < answer["residuals"]["doppler"]["rms"] < 15  # Hz
+    squint_found = answer["antenna_from_tracker"]["squint"]
+    assert abs(np.rad2deg(squint_found["angle_rad"])) < 2e-3
+    assert squint_found["sigma_scatter_rad"] > 5 * squint_found["sigma_rad"]  # scenes differ by more than their noise
+    turn = Rotation.from_quat(answer["antenna_from_tracker"]["quaternion"], scalar_first=True).as_rotvec()
+    assert abs(turn[1]) < 1e-6
 
 
 @needs_data
