@@ -31,9 +31,15 @@ def _row(system: BookSystem, simulated: Simulated, run: FilterRun, seconds: floa
     scale = np.array([1.0, system.case.radius, system.case.radius])
     error = position_errors(system.case, simulated.truth, run.state)[:, at]
     sigma = np.linalg.norm(run.sigma[:, at, :3] * scale, axis=1)
-    return {"filter": run.name, "error_km": float(np.median(error)) / 1e3, "sigma_km": float(np.median(sigma)) / 1e3,
-            "error_over_sigma": float(np.median(error / sigma)), "diverged": int(run.diverged().sum()),
-            "runs": len(error), "seconds": seconds}
+    return {
+        "filter": run.name,
+        "error_km": float(np.median(error)) / 1e3,
+        "sigma_km": float(np.median(sigma)) / 1e3,
+        "error_over_sigma": float(np.median(error / sigma)),
+        "diverged": int(run.diverged().sum()),
+        "runs": len(error),
+        "seconds": seconds,
+    }
 
 
 def _works(system: BookSystem, simulated: Simulated) -> dict[str, Callable[[], FilterRun]]:
@@ -68,12 +74,19 @@ def filters(runs: int, step: float, seed: int) -> list[dict[str, Any]]:
                 for name, work in tried.items():
                     began = time.perf_counter()
                     row = _row(system, simulated, work(), time.perf_counter() - began)
-                    row |= {"filter": name, "deviation_sigma": deviation, "burn_s": burn[1] - burn[0],
-                            "orbit": "stationary" if stationary else "book"}
+                    row |= {
+                        "filter": name,
+                        "deviation_sigma": deviation,
+                        "burn_s": burn[1] - burn[0],
+                        "orbit": "stationary" if stationary else "book",
+                    }
                     rows.append(row)
-                    print(f"{row['orbit']:<11}{row['deviation_sigma']:>4.0f} sigma  burn {row['burn_s']:>5.0f} s  "
-                          f"{name:<18}error {row['error_km']:>11.3f} km  sigma {row['sigma_km']:>7.3f} km  ratio "
-                          f"{row['error_over_sigma']:>9.2f}  diverged {row['diverged']}/{row['runs']}", flush=True)
+                    print(
+                        f"{row['orbit']:<11}{row['deviation_sigma']:>4.0f} sigma  burn {row['burn_s']:>5.0f} s  "
+                        f"{name:<18}error {row['error_km']:>11.3f} km  sigma {row['sigma_km']:>7.3f} km  ratio "
+                        f"{row['error_over_sigma']:>9.2f}  diverged {row['diverged']}/{row['runs']}",
+                        flush=True,
+                    )
     return rows
 
 
@@ -91,10 +104,13 @@ def bound(runs: int, step: float, seed: int) -> dict[str, Any]:
         scale = case.prior
         inner = estimate.covariance / np.outer(scale, scale)
         squares.append(float(error / scale @ np.linalg.solve(inner, error / scale)))
-    return {"runs": runs, "ratio": float(np.sqrt(np.mean(ratios))),
-            "ratio_per_component": np.sqrt(np.mean(ratios, axis=0)).tolist(),
-            "nees_over_size": float(np.mean(squares)) / SIZE,
-            "nees_sigma": float(np.sqrt(2 / (SIZE * runs)))}
+    return {
+        "runs": runs,
+        "ratio": float(np.sqrt(np.mean(ratios))),
+        "ratio_per_component": np.sqrt(np.mean(ratios, axis=0)).tolist(),
+        "nees_over_size": float(np.mean(squares)) / SIZE,
+        "nees_sigma": float(np.sqrt(2 / (SIZE * runs))),
+    }
 
 
 def main() -> None:

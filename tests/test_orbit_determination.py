@@ -40,21 +40,35 @@ EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
 EPOCH = "2021-06-04T00:00:00"
 POSITION, VELOCITY = (-40.5e6, -10.0e6, 0.17e6), (760.0, -1475.0, 55.0)
-STATIONS = {name: Station(name, np.radians(latitude), np.radians(longitude), altitude) for name, latitude, longitude,
-            altitude in (("Africa", -25.9, 27.7, 1560.0), ("East", 36.1, 127.5, 180.0), ("South", -30.6, 151.6, 1160.0),
-                         ("West", 39.3, -104.8, 2095.0))}
+STATIONS = {
+    name: Station(name, np.radians(latitude), np.radians(longitude), altitude)
+    for name, latitude, longitude, altitude in (
+        ("Africa", -25.9, 27.7, 1560.0),
+        ("East", 36.1, 127.5, 180.0),
+        ("South", -30.6, 151.6, 1160.0),
+        ("West", 39.3, -104.8, 2095.0),
+    )
+}
 
 
 def settings(**changes: object) -> OrbitSettings:
     """Settings of the generated case: 4 x 4 gravity, Sun and Moon."""
-    tables = {"orbit": {"epoch": EPOCH, "frame": "GCRF", "position_m": list(POSITION), "velocity_m_s": list(VELOCITY)},
-              "forces": {"degree": 4}, "measurements": {"range_sigma_m": 5.0, "azimuth_sigma_deg": 0.01,
-                                                        "elevation_sigma_deg": 0.01}}
+    tables = {
+        "orbit": {"epoch": EPOCH, "frame": "GCRF", "position_m": list(POSITION), "velocity_m_s": list(VELOCITY)},
+        "forces": {"degree": 4},
+        "measurements": {"range_sigma_m": 5.0, "azimuth_sigma_deg": 0.01, "elevation_sigma_deg": 0.01},
+    }
     return replace(settings_from(tables, STATIONS), **changes)  # type: ignore[arg-type]
 
 
-def generated(chosen: OrbitSettings, hours: float = 10.0, seed: int = 1, *, effects: dict[str, np.ndarray] | None = None,
-              noise: bool = True) -> Tracking:
+def generated(
+    chosen: OrbitSettings,
+    hours: float = 10.0,
+    seed: int = 1,
+    *,
+    effects: dict[str, np.ndarray] | None = None,
+    noise: bool = True,
+) -> Tracking:
     """Measurements of the settings' own orbit wherever a station sees it, with declared noise and given effects."""
     epoch = tai_from_utc([EPOCH])[0]
     time = np.arange(300.0, hours * 3600, 420.0)
@@ -107,16 +121,35 @@ def test_generated_orbit_is_recovered_within_its_covariance(solution: OrbitSolut
 
 def test_jacobian_of_the_whole_problem_equals_finite_differences(tracking: Tracking) -> None:
     model = orbit_model(tracking, settings())
-    names = ["constant-acceleration:orbital", "solar-radiation-pressure", "impulsive-manoeuvre", "range-bias:West",
-             "station-position-error:South", "timetag-offset:East", "range-scale-error", "earth-rotation-offset",
-             "tropospheric-delay:South", "ionospheric-delay:South"]
+    names = [
+        "constant-acceleration:orbital",
+        "solar-radiation-pressure",
+        "impulsive-manoeuvre",
+        "range-bias:West",
+        "station-position-error:South",
+        "timetag-offset:East",
+        "range-scale-error",
+        "earth-rotation-offset",
+        "tropospheric-delay:South",
+        "ionospheric-delay:South",
+    ]
     problem = orbit_problem(model, names)
     values = dict(problem.start)
     values["impulsive-manoeuvre"] = np.array([15000.0, 0.3, -0.5, 0.2])
-    steps = {"position": 5.0, "velocity": 5e-3, "constant-acceleration:orbital": 1e-8, "solar-radiation-pressure": 0.5,
-             "impulsive-manoeuvre": 1e-2, "range-bias:West": 1.0, "station-position-error:South": 1.0,
-             "timetag-offset:East": 1e-3, "range-scale-error": 1e-8, "earth-rotation-offset": 1e-6,
-             "tropospheric-delay:South": 0.1, "ionospheric-delay:South": 0.1}
+    steps = {
+        "position": 5.0,
+        "velocity": 5e-3,
+        "constant-acceleration:orbital": 1e-8,
+        "solar-radiation-pressure": 0.5,
+        "impulsive-manoeuvre": 1e-2,
+        "range-bias:West": 1.0,
+        "station-position-error:South": 1.0,
+        "timetag-offset:East": 1e-3,
+        "range-scale-error": 1e-8,
+        "earth-rotation-offset": 1e-6,
+        "tropospheric-delay:South": 0.1,
+        "ionospheric-delay:South": 0.1,
+    }
     for residual in problem.residuals:
         assert isinstance(residual, KernelResidual)
         exact = residual.linearize(values)
@@ -137,12 +170,15 @@ def test_jacobian_of_the_whole_problem_equals_finite_differences(tracking: Track
                 column += 1
 
 
-@pytest.mark.parametrize(("name", "value"), [
-    ("constant-acceleration", np.array([4e-6, -3e-6, 5e-6])),
-    ("range-bias:West", np.array([120.0])),
-    ("timetag-offset:East", np.array([0.05])),
-    ("station-position-error:South", np.array([80.0, -60.0, 150.0])),
-])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("constant-acceleration", np.array([4e-6, -3e-6, 5e-6])),
+        ("range-bias:West", np.array([120.0])),
+        ("timetag-offset:East", np.array([0.05])),
+        ("station-position-error:South", np.array([80.0, -60.0, 150.0])),
+    ],
+)
 def test_effects_are_estimated_where_they_are_and_gap_is_said_where_they_are_not(name: str, value: np.ndarray) -> None:
     data = generated(settings(), effects={name: value})
     found = solve_tracking(data, settings(), effects=[name])
@@ -212,7 +248,13 @@ def test_w3b_reaches_the_published_numbers() -> None:
     assert rows["all/elevation"]["standard_deviation"] <= 0.0117
     leak = found.estimate.values["constant-acceleration:linear"][:3]
     assert np.linalg.norm(leak) == pytest.approx(8.005e-6, rel=0.02)
-    published = {"CastleRock": 11274.42, "Fucino": 13467.84, "Kumsan": 13512.49, "Pretoria": 13594.18, "Uralla": 13450.23}
+    published = {
+        "CastleRock": 11274.42,
+        "Fucino": 13467.84,
+        "Kumsan": 13512.49,
+        "Pretoria": 13594.18,
+        "Uralla": 13450.23,
+    }
     for station, bias in published.items():
         assert found.parameters()[f"range-bias:{station}"]["value"] == pytest.approx(bias, abs=2.0)
 
@@ -223,12 +265,35 @@ def test_settings_of_the_example_give_the_same_orbit_on_the_command_line(tmp_pat
     top.add_typer(app, name="orbit")
     top.command("other")(lambda: None)
     out = tmp_path / "w3b.oem"
-    result = CliRunner().invoke(top, ["orbit", "solve", str(W3B / "W3B.aer"), "--settings", str(EXAMPLES / "w3b.toml"),
-                                      str(W3B / "bulletinb-274.txt"), "--json", "--oem", str(out)])
+    result = CliRunner().invoke(
+        top,
+        [
+            "orbit",
+            "solve",
+            str(W3B / "W3B.aer"),
+            "--settings",
+            str(EXAMPLES / "w3b.toml"),
+            str(W3B / "bulletinb-274.txt"),
+            "--json",
+            "--oem",
+            str(out),
+        ],
+    )
     assert result.exit_code == 0, result.output
     answer = json.loads(result.stdout)
-    assert set(answer) >= {"status", "why", "epoch", "frame", "position_m", "velocity_m_s", "covariance", "parameters",
-                           "residuals", "effects", "seconds"}
+    assert set(answer) >= {
+        "status",
+        "why",
+        "epoch",
+        "frame",
+        "position_m",
+        "velocity_m_s",
+        "covariance",
+        "parameters",
+        "residuals",
+        "effects",
+        "seconds",
+    }
     assert np.linalg.norm(np.array(answer["position_m"]) - [-40541446.236, -9905357.943, 206777.082]) < 10.0
     assert set(answer["residuals"]["Uralla/range"]) >= {"count", "rms", "unit"}
     ephemeris = read_oem(out)
@@ -241,8 +306,9 @@ def test_settings_of_the_example_give_the_same_orbit_on_the_command_line(tmp_pat
 
 def test_tdm_is_read_as_it_was_written(tmp_path: Path, tracking: Tracking) -> None:
     path = tmp_path / "pass.tdm"
-    bistatic = Observations("range_rate", "East", "Africa", tracking.observations[0].time[:5],
-                            np.linspace(-40, 40, 5)[:, None])
+    bistatic = Observations(
+        "range_rate", "East", "Africa", tracking.observations[0].time[:5], np.linspace(-40, 40, 5)[:, None]
+    )
     both = tracking.merged(Tracking((bistatic,)))
     write_tdm(path, replace(both, satellite="SAT"))
     again = read_tdm(path)
@@ -301,7 +367,7 @@ def test_gmd_day_count_and_legs(tmp_path: Path) -> None:
     assert data.observations[0].value[0, 0] == pytest.approx(78717485.944)
     assert chosen.legs == "sum" and len(chosen.stations) == 7
     path.write_text("12.5 Range 9002 0 99 1.0\n129.0 Range 9002 0 99 1.0\n")
-    with pytest.raises(FileFormatError, match="day count|no modified"):
+    with pytest.raises(FileFormatError, match="no modified Julian date"):
         read_files([path])
 
 
@@ -324,7 +390,9 @@ def test_a_range_below_any_orbit_is_refused(tracking: Tracking) -> None:
 
 
 def test_two_measurements_are_too_few(tracking: Tracking) -> None:
-    two = replace(tracking, observations=(tracking.observations[0].subset(np.arange(len(tracking.observations[0].time)) < 2),))
+    two = replace(
+        tracking, observations=(tracking.observations[0].subset(np.arange(len(tracking.observations[0].time)) < 2),)
+    )
     with pytest.raises(TooFewDataError, match="six unknowns"):
         orbit_model(two, settings())
 
@@ -350,8 +418,10 @@ def test_a_station_on_the_wrong_continent_is_named(tracking: Tracking, longitude
 
 
 def test_times_an_hour_off_are_refused_or_said(tracking: Tracking) -> None:
-    shifted = replace(tracking, observations=tuple(replace(o, time=o.time + np.timedelta64(6 * 3600, "s"))
-                                                   for o in tracking.observations))
+    shifted = replace(
+        tracking,
+        observations=tuple(replace(o, time=o.time + np.timedelta64(6 * 3600, "s")) for o in tracking.observations),
+    )
     try:
         found = solve_tracking(shifted, settings())
     except InputError as error:
@@ -361,7 +431,7 @@ def test_times_an_hour_off_are_refused_or_said(tracking: Tracking) -> None:
 
 
 def test_unknown_station_setting_and_file_are_named(tracking: Tracking, tmp_path: Path) -> None:
-    with pytest.raises(MissingDataError, match="Africa|East|South|West"):
+    with pytest.raises(MissingDataError, match="the settings do not have"):
         orbit_model(tracking, replace(settings(), stations={}))
     with pytest.raises(RequestError, match="did you mean 'degree'"):
         settings_from({"forces": {"degre": 4}}, {})
@@ -378,7 +448,9 @@ def test_unknown_station_setting_and_file_are_named(tracking: Tracking, tmp_path
 
 
 def test_a_date_without_earth_orientation_is_refused(tracking: Tracking) -> None:
-    late = replace(tracking, observations=tuple(replace(o, time=o.time + np.timedelta64(20 * 365, "D"))
-                                                for o in tracking.observations))
+    late = replace(
+        tracking,
+        observations=tuple(replace(o, time=o.time + np.timedelta64(20 * 365, "D")) for o in tracking.observations),
+    )
     with pytest.raises(InputError, match="orientation"):
         orbit_model(late, settings(position=None, velocity=None, epoch=None))

@@ -1,4 +1,5 @@
-"""The book's system: the filters' mathematics, divergence of the linear one, the batch and the smoother at the bound."""
+"""The book's system: the filters' mathematics, divergence of the linear one, the batch and the smoother at the
+bound."""
 
 from __future__ import annotations
 
@@ -42,8 +43,9 @@ def linear_case() -> tuple[LinearSystem, np.ndarray, np.ndarray, np.ndarray]:
     return system, first, covariance, z
 
 
-def joint_posterior(system: LinearSystem, first: np.ndarray, covariance: np.ndarray,
-                    z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def joint_posterior(
+    system: LinearSystem, first: np.ndarray, covariance: np.ndarray, z: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Mean (runs, steps + 1, 3) and covariance blocks (steps + 1, 3, 3) from the one big Gaussian, no recursion."""
     n = system.steps + 1
     mean, big = np.empty((n, 3)), np.zeros((3 * n, 3 * n))
@@ -72,12 +74,14 @@ def test_every_filter_equals_the_joint_posterior_of_a_linear_system(linear_case)
     nominal = [first]
     for _ in range(system.steps):
         nominal.append(system._phi @ nominal[-1])
-    runs = [filters.linear_filter(system, np.array(nominal), system._phi, first, covariance, z),
-            filters.extended_filter(system, first, covariance, z),
-            filters.extended_filter(system, first, covariance, z, iterations=3),
-            filters.square_root_filter(system, first, covariance, z),
-            filters.unscented_filter(system, first, covariance, z),
-            filters.schmidt_filter(system, first, covariance, z, [])]
+    runs = [
+        filters.linear_filter(system, np.array(nominal), system._phi, first, covariance, z),
+        filters.extended_filter(system, first, covariance, z),
+        filters.extended_filter(system, first, covariance, z, iterations=3),
+        filters.square_root_filter(system, first, covariance, z),
+        filters.unscented_filter(system, first, covariance, z),
+        filters.schmidt_filter(system, first, covariance, z, []),
+    ]
     for run in runs:
         assert run.state[:, -1] == pytest.approx(mean[:, -1], abs=1e-9), run.name
         assert run.covariance[0] == pytest.approx(blocks[-1], abs=1e-9), run.name
@@ -122,8 +126,11 @@ def test_jacobians_of_the_book_equal_finite_differences(system: BookSystem) -> N
             step[i] = unit[i]
             for function, exact in ((system.propagate, phi), (system.observe, h)):
                 numeric = (function(k, x + step)[0] - function(k, x - step)[0])[0] / (2 * unit[i])
-                scale = np.abs(exact[0]).max(axis=1) * 1e-5 + np.abs(numeric) * 1e-4 + 1e-10 / unit[i] * np.abs(
-                    function(k, x)[0][0])
+                scale = (
+                    np.abs(exact[0]).max(axis=1) * 1e-5
+                    + np.abs(numeric) * 1e-4
+                    + 1e-10 / unit[i] * np.abs(function(k, x)[0][0])
+                )
                 assert (np.abs(numeric - exact[0, :, i]) <= scale + 1e-12).all()
 
 
@@ -133,8 +140,9 @@ def test_the_printed_orbit_is_read_both_ways() -> None:
     second = np.degrees(as_latitude.first_state[1])
     assert first == pytest.approx(np.degrees(1.3 + 4.7) - 360 * 0, abs=0.1)
     assert second == pytest.approx(np.degrees(1.7), abs=0.1)
-    assert BookCase(inclination_in_degrees=True).first_state[2] == pytest.approx(BookCase().first_state[2] * np.pi / 180,
-                                                                                 rel=1e-3)
+    assert BookCase(inclination_in_degrees=True).first_state[2] == pytest.approx(
+        BookCase().first_state[2] * np.pi / 180, rel=1e-3
+    )
 
 
 def test_prior_sigma_of_the_period_is_the_printed_850_seconds() -> None:
@@ -182,8 +190,9 @@ def test_joint_batch_reaches_the_bound_and_equals_the_smoother(system: BookSyste
         normalized.append(error / unit @ np.linalg.solve(estimate.covariance / np.outer(unit, unit), error / unit))
     assert float(np.sqrt(np.mean(ratios))) == pytest.approx(1.0, abs=0.16)  # 336 squares, 4 sigma
     assert float(np.mean(normalized)) / SIZE == pytest.approx(1.0, abs=4 * np.sqrt(2 / (SIZE * runs)))
-    smoother = filters.iterated_smoother(system, case.first_state, np.diag(case.prior**2), simulated.measurements[:3],
-                                         passes=12, tolerance=1e-5)
+    smoother = filters.iterated_smoother(
+        system, case.first_state, np.diag(case.prior**2), simulated.measurements[:3], passes=12, tolerance=1e-5
+    )
     gap = np.abs(smoother.state[:, 0] - np.array(estimates[:3])) / smoother.sigma[:, 0]
     assert gap.max() < 0.02
 

@@ -69,8 +69,10 @@ def test_geostationary_tesseral_acceleration_has_the_published_size() -> None:
     x = ca.SX.sym("x", 3)
     f = compiled_number(gravity(x, field)[0], x)
     longitude = np.linspace(0, 2 * np.pi, 720)
-    along = [float(np.asarray(f(RADIUS * np.array([np.cos(a), np.sin(a), 0]))).ravel() @ [-np.sin(a), np.cos(a), 0])
-             for a in longitude]
+    along = [
+        float(np.asarray(f(RADIUS * np.array([np.cos(a), np.sin(a), 0]))).ravel() @ [-np.sin(a), np.cos(a), 0])
+        for a in longitude
+    ]
     assert 5.3e-8 < max(along) < 5.8e-8
     crossings = np.degrees(longitude[:-1][np.diff(np.sign(along)) != 0])
     assert sorted(np.round(crossings)) == pytest.approx([75, 165, 255, 345], abs=3)
@@ -104,7 +106,7 @@ def low_step() -> VariationalStep:
     field = gravity_field("EGM2008_120", 4)
 
     def derivative(x, p, u):  # type: ignore[no-untyped-def]
-        pull, gradient = gravity(x[:3], field)
+        pull, _ = gravity(x[:3], field)
         rate = ca.vertcat(x[3:], pull + p[0] * x[3:])
         return rate, None, None
 
@@ -126,8 +128,15 @@ def test_propagation_equals_scipy_through_a_low_perigee(low_step: VariationalSte
     x = ca.SX.sym("x", 6)
     right = ca.Function("r", [x], [ca.vertcat(x[3:], gravity(x[:3], field)[0])])
     times = np.linspace(0, 57600.0, 200)
-    reference = solve_ivp(lambda t, y: np.asarray(right(y)).ravel(), (0, 57600.0), START, method="DOP853", rtol=3e-14,
-                          atol=1e-7, t_eval=times)
+    reference = solve_ivp(
+        lambda t, y: np.asarray(right(y)).ravel(),
+        (0, 57600.0),
+        START,
+        method="DOP853",
+        rtol=3e-14,
+        atol=1e-7,
+        t_eval=times,
+    )
     state, _ = orbit.at(times)
     assert np.abs(state[:, :3] - reference.y[:3].T).max() < 0.02
     assert np.linalg.norm(state[:, :3], axis=1).min() < 6.7e6
@@ -163,8 +172,14 @@ def test_variational_equations_equal_finite_differences(low_step: VariationalSte
 def test_a_looser_tolerance_is_less_exact_and_cheaper(low_step: VariationalStep) -> None:
     span = np.array([0.0, 57600.0])
     tight, _ = propagate(low_step, low_step.start(START), np.array([0.0]), nothing, span)
-    loose, _ = propagate(low_step, low_step.start(START), np.array([0.0]), nothing, span,
-                         tolerance=Tolerance(1e-9, (1.0,) * 3 + (1e-3,) * 3))
+    loose, _ = propagate(
+        low_step,
+        low_step.start(START),
+        np.array([0.0]),
+        nothing,
+        span,
+        tolerance=Tolerance(1e-9, (1.0,) * 3 + (1e-3,) * 3),
+    )
     assert len(loose.times) < len(tight.times)
     assert 1e-3 < np.linalg.norm(loose.values[-1][:3] - tight.values[-1][:3]) < 1e4
 
@@ -175,13 +190,25 @@ def test_spherical_equals_cartesian_motion_below_a_millimetre_in_a_day() -> None
     cartesian = ca.Function("c", [x, u], [cartesian_rates(x, u)])
     to_cartesian = ca.Function("t", [x], [cartesian_from_spherical(x)])
     start = np.array([42.1e6, 1.7, 0.03, 12.0, RATE * 1.002, 2e-7])
+    unit = np.array([1e7, 1, 1, 1e3, 1e-4, 1e-4])
     for thrust in (0.0, 1e-3):
         span = 86400.0 if thrust == 0.0 else 3600.0
-        unit = np.array([1e7, 1, 1, 1e3, 1e-4, 1e-4])
-        one = solve_ivp(lambda t, y, a=thrust: np.asarray(spherical(y * unit, a)).ravel() / unit, (0, span), start / unit,
-                        method="DOP853", rtol=1e-13, atol=1e-15)
-        two = solve_ivp(lambda t, y, a=thrust: np.asarray(cartesian(y, a)).ravel(), (0, span),
-                        np.asarray(to_cartesian(start)).ravel(), method="DOP853", rtol=1e-13, atol=1e-7)
+        one = solve_ivp(
+            lambda t, y, a=thrust: np.asarray(spherical(y * unit, a)).ravel() / unit,
+            (0, span),
+            start / unit,
+            method="DOP853",
+            rtol=1e-13,
+            atol=1e-15,
+        )
+        two = solve_ivp(
+            lambda t, y, a=thrust: np.asarray(cartesian(y, a)).ravel(),
+            (0, span),
+            np.asarray(to_cartesian(start)).ravel(),
+            method="DOP853",
+            rtol=1e-13,
+            atol=1e-7,
+        )
         gap = np.asarray(to_cartesian(one.y[:, -1] * unit)).ravel()[:3] - two.y[:3, -1]
         assert np.linalg.norm(gap) < 1e-3
 

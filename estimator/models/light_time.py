@@ -87,8 +87,16 @@ class Path:
     receiver: tuple[Matrix, Matrix]
 
 
-def signal_path(state: Matrix, earth: Earth, transmitter: Matrix, receiver: Matrix, *, tag: TimeTag = "reception",
-                offset: Matrix = 0.0, light_time: Matrix = 1.0) -> Path:
+def signal_path(
+    state: Matrix,
+    earth: Earth,
+    transmitter: Matrix,
+    receiver: Matrix,
+    *,
+    tag: TimeTag = "reception",
+    offset: Matrix = 0.0,
+    light_time: Matrix = 1.0,
+) -> Path:
     """Solve the light-time equations of a signal from a station to the satellite and on to a station.
 
     Args:
@@ -115,8 +123,9 @@ def signal_path(state: Matrix, earth: Earth, transmitter: Matrix, receiver: Matr
         if tag != "reception":
             t3 = t2 + slow * length(earth.station(receiver, t3)[0] - satellite[0])
     sender, receptor = earth.station(transmitter, t1), earth.station(receiver, t3)
-    return Path(t1, t2, t3, length(satellite[0] - sender[0]), length(receptor[0] - satellite[0]), sender, satellite,
-                receptor)
+    return Path(
+        t1, t2, t3, length(satellite[0] - sender[0]), length(receptor[0] - satellite[0]), sender, satellite, receptor
+    )
 
 
 def range_sum_rate(path: Path) -> Matrix:

@@ -73,10 +73,12 @@ def installed_orientation(first: float, last: float) -> EarthOrientation:
     known = np.isfinite(np.asarray(table["UT1_UTC"].value, dtype=float))
     chosen = known & (date >= first - 6) & (date <= last + 6)
     if chosen.sum() < 2 or date[chosen][0] > first or date[chosen][-1] < last:
-        raise InputError("the Earth's orientation is not known for these dates",
-                         value=f"modified Julian date {first:.1f} to {last:.1f}",
-                         limit=f"{date[known][0]:.0f} to {date[known][-1]:.0f}",
-                         remedy="give a bulletin that covers the data, or update the package astropy-iers-data")
+        raise InputError(
+            "the Earth's orientation is not known for these dates",
+            value=f"modified Julian date {first:.1f} to {last:.1f}",
+            limit=f"{date[known][0]:.0f} to {date[known][-1]:.0f}",
+            remedy="give a bulletin that covers the data, or update the package astropy-iers-data",
+        )
     date = date[chosen]
 
     def column(name: str, scale: float) -> np.ndarray:
@@ -86,9 +88,15 @@ def installed_orientation(first: float, last: float) -> EarthOrientation:
     import astropy.units as u
 
     unit = float(table["dX_2000A"].unit.to(u.arcsec))
-    return EarthOrientation(date, column("UT1_UTC", 1.0) - tai_minus_utc(date), column("PM_x", _ARC_SECOND),
-                            column("PM_y", _ARC_SECOND), column("dX_2000A", unit * _ARC_SECOND),
-                            column("dY_2000A", unit * _ARC_SECOND), "installed IERS bulletin A")
+    return EarthOrientation(
+        date,
+        column("UT1_UTC", 1.0) - tai_minus_utc(date),
+        column("PM_x", _ARC_SECOND),
+        column("PM_y", _ARC_SECOND),
+        column("dX_2000A", unit * _ARC_SECOND),
+        column("dY_2000A", unit * _ARC_SECOND),
+        "installed IERS bulletin A",
+    )
 
 
 _ROW = re.compile(r"^\s*\d{4}\s+\d{1,2}\s+\d{1,2}\s+(\d{5})((?:\s+-?\d+\.\d+){5,})\s*$")
@@ -113,13 +121,23 @@ def read_bulletin_b(paths: Sequence[str | Path]) -> EarthOrientation:
                 rows[float(match[1])] = tuple(float(w) for w in match[2].split()[:5])
                 found += 1
         if found == 0:
-            raise FileFormatError("no daily Earth orientation values found", where=str(path),
-                                  limit="IERS Bulletin B in its format since 2010")
+            raise FileFormatError(
+                "no daily Earth orientation values found",
+                where=str(path),
+                limit="IERS Bulletin B in its format since 2010",
+            )
     date = np.array(sorted(rows))
     values = np.array([rows[d] for d in date])
     mas = 1e-3 * _ARC_SECOND
-    return EarthOrientation(date, values[:, 2] * 1e-3 - tai_minus_utc(date), values[:, 0] * mas, values[:, 1] * mas,
-                            values[:, 3] * mas, values[:, 4] * mas, ", ".join(Path(p).name for p in paths))
+    return EarthOrientation(
+        date,
+        values[:, 2] * 1e-3 - tai_minus_utc(date),
+        values[:, 0] * mas,
+        values[:, 1] * mas,
+        values[:, 3] * mas,
+        values[:, 4] * mas,
+        ", ".join(Path(p).name for p in paths),
+    )
 
 
 def eme2000_from_gcrs() -> np.ndarray:
@@ -158,11 +176,14 @@ class SpaceEnvironment:
         table = self.orientation or installed_orientation(float(mjd[0]), float(mjd[1]))
         leap = float(tai_minus_utc(mjd[:1])[0])
         if table.date[0] > mjd[0] + 0.5 or table.date[-1] < mjd[1] - 0.5 - leap / _DAY:
-            raise InputError("the Earth orientation bulletin does not cover the data", where=table.source,
-                             value=f"modified Julian date {mjd[0] + 0.5:.2f} to {mjd[1] - 0.5:.2f}",
-                             limit=f"{table.date[0]:.0f} to {table.date[-1]:.0f}",
-                             remedy="give the bulletin of the data's dates, or none to use the installed table; check "
-                                    "that the times are in the scale and the day count that the settings say")
+            raise InputError(
+                "the Earth orientation bulletin does not cover the data",
+                where=table.source,
+                value=f"modified Julian date {mjd[0] + 0.5:.2f} to {mjd[1] - 0.5:.2f}",
+                limit=f"{table.date[0]:.0f} to {table.date[-1]:.0f}",
+                remedy="give the bulletin of the data's dates, or none to use the installed table; check "
+                "that the times are in the scale and the day count that the settings say",
+            )
         tai_of_table = table.date - _MJD_OF_J2000 + tai_minus_utc(table.date) / _DAY
         kind = CubicSpline if len(table.date) > 3 else _linear
         t = self._tables

@@ -64,9 +64,28 @@ def solar_pressure(position: Matrix, sun: Matrix, area_over_mass: Matrix) -> Mat
 
 
 _HEIGHTS = np.array([120, 130, 140, 150, 180, 200, 220, 250, 300, 350, 400, 450, 500, 600, 700, 800, 900, 1000.0])  # km
-_DENSITIES = np.array([  # kg/m3, US Standard Atmosphere 1976
-    2.222e-8, 8.152e-9, 3.831e-9, 2.076e-9, 5.194e-10, 2.541e-10, 1.367e-10, 6.073e-11, 1.916e-11, 7.014e-12, 2.803e-12,
-    1.184e-12, 5.215e-13, 1.137e-13, 3.070e-14, 1.136e-14, 5.759e-15, 3.561e-15])
+_DENSITIES = np.array(
+    [  # kg/m3, US Standard Atmosphere 1976
+        2.222e-8,
+        8.152e-9,
+        3.831e-9,
+        2.076e-9,
+        5.194e-10,
+        2.541e-10,
+        1.367e-10,
+        6.073e-11,
+        1.916e-11,
+        7.014e-12,
+        2.803e-12,
+        1.184e-12,
+        5.215e-13,
+        1.137e-13,
+        3.070e-14,
+        1.136e-14,
+        5.759e-15,
+        3.561e-15,
+    ]
+)
 _FIT = np.polynomial.Polynomial.fit(np.log(_HEIGHTS - 90), np.log(_DENSITIES), 7)
 _FIT_COEFFICIENTS = _FIT.convert().coef
 _SCALE_HEIGHT_ABOVE = 268e3  # m, of the table's end

@@ -50,11 +50,20 @@ class GravityField:
         """
         order = degree if order is None else order
         if not 0 <= order <= degree <= self.degree:
-            raise RequestError("the gravity field has no such degree and order", where=self.name,
-                               value=f"{degree} x {order}", limit=f"{self.degree} x {self.degree}")
+            raise RequestError(
+                "the gravity field has no such degree and order",
+                where=self.name,
+                value=f"{degree} x {order}",
+                limit=f"{self.degree} x {self.degree}",
+            )
         keep = np.arange(degree + 1) <= order
-        return GravityField(self.name, self.gravitational_parameter, self.radius,
-                            self.cosine[: degree + 1, : degree + 1] * keep, self.sine[: degree + 1, : degree + 1] * keep)
+        return GravityField(
+            self.name,
+            self.gravitational_parameter,
+            self.radius,
+            self.cosine[: degree + 1, : degree + 1] * keep,
+            self.sine[: degree + 1, : degree + 1] * keep,
+        )
 
 
 @cache
@@ -81,8 +90,11 @@ def gravity_field(name: str = "EGM2008_120", degree: int = 20) -> GravityField:
                 cosine[n, m], sine[n, m] = model.get(n, m)
         return GravityField(name, float(model.gm), float(model.radius), cosine, sine)
     if not Path(name).exists():
-        raise RequestError("no such gravity field", where=name, remedy="choose from " + ", ".join(CARRIED)
-                           + ", or give the path of an ICGEM .gfc file")
+        raise RequestError(
+            "no such gravity field",
+            where=name,
+            remedy="choose from " + ", ".join(CARRIED) + ", or give the path of an ICGEM .gfc file",
+        )
     return _read_icgem(Path(name), degree)
 
 
@@ -102,14 +114,16 @@ def _read_icgem(path: Path, degree: int) -> GravityField:
                 if n <= degree:
                     cosine[n, m], sine[n, m] = float(words[3]), float(words[4])
             except (ValueError, IndexError) as error:
-                raise FileFormatError("a coefficient line cannot be read", where=f"{path}:{number}",
-                                      value=line.strip()[:60]) from error
+                raise FileFormatError(
+                    "a coefficient line cannot be read", where=f"{path}:{number}", value=line.strip()[:60]
+                ) from error
     try:
         parameter = float(header["earth_gravity_constant"].replace("D", "e").replace("d", "e"))
         radius = float(header["radius"].replace("D", "e").replace("d", "e"))
     except (KeyError, ValueError) as error:
-        raise FileFormatError("this is no ICGEM gravity field: earth_gravity_constant or radius is missing",
-                              where=str(path)) from error
+        raise FileFormatError(
+            "this is no ICGEM gravity field: earth_gravity_constant or radius is missing", where=str(path)
+        ) from error
     if highest < degree:
         raise RequestError("the gravity field has no such degree", where=str(path), value=degree, limit=highest)
     return GravityField(path.name, parameter, radius, cosine, sine)
@@ -194,14 +208,19 @@ def gravity(position: Matrix, field: GravityField, *, lowest_degree: int = 0) ->
         field: coefficients, all of whose terms from ``lowest_degree`` up are used.
         lowest_degree: 0 for the whole field, 2 for what it adds to the central term.
     """
-    scale = np.array([[_unnormalized(n, m) if m <= n and n >= lowest_degree else 0.0 for m in range(field.degree + 1)]
-                      for n in range(field.degree + 1)])
+    scale = np.array(
+        [
+            [_unnormalized(n, m) if m <= n and n >= lowest_degree else 0.0 for m in range(field.degree + 1)]
+            for n in range(field.degree + 1)
+        ]
+    )
     potential = (field.cosine * scale, field.sine * scale)
     v, w = _solid_harmonics(position, field.radius, field.degree + 2)
     first = [_along(potential, axis) for axis in range(3)]
     size = field.gravitational_parameter / field.radius**2
     acceleration = size * ca.vertcat(*(_sum(f, v, w) for f in first))
     xx, xy, xz, yy, yz = (_sum(_along(first[a], b), v, w) for a, b in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2)))
-    gradient = size / field.radius * ca.vertcat(ca.horzcat(xx, xy, xz), ca.horzcat(xy, yy, yz),
-                                                ca.horzcat(xz, yz, -xx - yy))
+    gradient = (
+        size / field.radius * ca.vertcat(ca.horzcat(xx, xy, xz), ca.horzcat(xy, yy, yz), ca.horzcat(xz, yz, -xx - yy))
+    )
     return acceleration, gradient

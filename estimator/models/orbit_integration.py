@@ -1,10 +1,10 @@
 """An orbit and its derivatives along initial state and parameters, by an embedded Runge-Kutta formula of order 8.
 
 One compiled function advances the state and its variational equations together through one step of Dormand and
-Prince's 8(5,3) (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, section II.5; the coefficients are
-those of ``scipy.integrate.DOP853``), with error estimate and continuous output. What drives the motion from outside
-(the orientation of the Earth, the Sun, the Moon) enters as numbers at the stages' times, so the equations of motion
-are differentiated once, symbolically, and nothing is integrated again per unknown.
+Prince's 8(5,3) (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, section II.5; the
+coefficients are those of ``scipy.integrate.DOP853``), with error estimate and continuous output. What drives the
+motion from outside (the orientation of the Earth, the Sun, the Moon) enters as numbers at the stages' times, so the
+equations of motion are differentiated once, symbolically, and nothing is integrated again per unknown.
 
 The grid of steps is found by error control and then kept while the orbit stays close to the one that made it, which
 makes the map from unknowns to states smooth across iterations.
@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import casadi as ca
 import numpy as np
@@ -50,8 +51,9 @@ class VariationalStep:
     state and the active parameters.
     """
 
-    def __init__(self, name: str, derivative: Derivative, state: int, parameters: int, inputs: int,
-                 active: tuple[int, ...]):
+    def __init__(
+        self, name: str, derivative: Derivative, state: int, parameters: int, inputs: int, active: tuple[int, ...]
+    ):
         self.state, self.parameters, self.inputs, self.active = state, parameters, inputs, active
         x, p, u = ca.SX.sym("x", state), ca.SX.sym("p", parameters), ca.SX.sym("u", inputs)
         self.columns = state + len(active)
@@ -98,9 +100,13 @@ def _step_function(name: str, right: ca.Function, size: int, state: int, paramet
         slopes.append(right(y + h * weighted(row[: _MAIN + 1 + i]), p, table[:, _MAIN + 1 + i]))
     change = after - y
     dense = [change, h * k0 - change, 2 * change - h * (slopes[_MAIN] + k0), *(h * weighted(row) for row in DOP853.D)]
-    return ca.Function(name, [y, k0, p, table, h],
-                       [after, slopes[_MAIN], ca.horzcat(*dense), h * fifth, h * third],
-                       ["y", "k", "p", "u", "h"], ["y_next", "k_next", "dense", "fifth", "third"])
+    return ca.Function(
+        name,
+        [y, k0, p, table, h],
+        [after, slopes[_MAIN], ca.horzcat(*dense), h * fifth, h * third],
+        ["y", "k", "p", "u", "h"],
+        ["y_next", "k_next", "dense", "fifth", "third"],
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,8 +138,10 @@ class DenseOrbit:
         forward = self.times[-1] >= self.times[0]
         nodes, wanted = (self.times, times) if forward else (-self.times, -times)
         if len(times) and (wanted.min() < nodes[0] - 1e-6 or wanted.max() > nodes[-1] + 1e-6):
-            raise ValueError(f"time outside the propagated span: {times.min()} to {times.max()} s against "
-                             f"{self.times[0]} to {self.times[-1]} s")
+            raise ValueError(
+                f"time outside the propagated span: {times.min()} to {times.max()} s against "
+                f"{self.times[0]} to {self.times[-1]} s"
+            )
         if len(self.dense) == 0:
             stacked = np.broadcast_to(self.values[0], (len(times), self.values.shape[1]))
         else:
@@ -151,15 +159,25 @@ class DenseOrbit:
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Error allowed per step of the state: ``absolute + relative |x|``, one pair for positions and one for velocities."""
+    """Error allowed per step of the state: ``absolute + relative |x|``, one pair for positions and one for
+    velocities."""
 
     relative: float = 1e-13
     absolute: tuple[float, ...] = (1e-5, 1e-5, 1e-5, 1e-8, 1e-8, 1e-8)
 
 
-def propagate(step: VariationalStep, start: np.ndarray, parameters: np.ndarray, inputs: Inputs, breaks: np.ndarray,
-              *, grid: Grid | None = None, tolerance: Tolerance | None = None, first_step: float = 60.0,
-              longest_step: float = np.inf) -> tuple[DenseOrbit, Grid]:
+def propagate(
+    step: VariationalStep,
+    start: np.ndarray,
+    parameters: np.ndarray,
+    inputs: Inputs,
+    breaks: np.ndarray,
+    *,
+    grid: Grid | None = None,
+    tolerance: Tolerance | None = None,
+    first_step: float = 60.0,
+    longest_step: float = np.inf,
+) -> tuple[DenseOrbit, Grid]:
     """Propagate from ``breaks[0]`` to ``breaks[-1]``, stopping at every break (the edge of a burn).
 
     Args:
@@ -183,7 +201,7 @@ def propagate(step: VariationalStep, start: np.ndarray, parameters: np.ndarray, 
     found: list[tuple[np.ndarray, np.ndarray]] = []
     direction = 1.0 if breaks[-1] >= breaks[0] else -1.0
     h = first_step
-    for number, (a, b) in enumerate(zip(breaks[:-1], breaks[1:], strict=True)):
+    for number, (a, b) in enumerate(pairwise(breaks)):
         if grid is not None:
             steps, tables = grid.segments[number]
         else:
@@ -218,7 +236,8 @@ def propagate(step: VariationalStep, start: np.ndarray, parameters: np.ndarray, 
             table = np.ascontiguousarray(inside(t + signed * STAGE_TIMES).T)
             after, k_after, coefficients, fifth, third = runner.advance(y, k, table, signed)
             scale = np.asarray(tolerance.absolute) + tolerance.relative * np.maximum(
-                np.abs(y[: step.state]), np.abs(after[: step.state]))
+                np.abs(y[: step.state]), np.abs(after[: step.state])
+            )
             e5, e3 = float(np.sum((fifth / scale) ** 2)), float(np.sum((third / scale) ** 2))
             error = 0.0 if e5 == 0 and e3 == 0 else e5 / np.sqrt((e5 + 0.01 * e3) * step.state)
             if not np.isfinite(error):
@@ -241,12 +260,20 @@ def propagate(step: VariationalStep, start: np.ndarray, parameters: np.ndarray, 
                 h = width * max(0.2, 0.9 * error ** (-1 / 8))
                 rejected = True
             if h < 1e-6 * max(1.0, abs(t) * 1e-9):
-                raise InfeasibleError("the orbit cannot be propagated: it comes too near the Earth's centre or is not "
-                                      "finite", limit="step of the integration")
+                raise InfeasibleError(
+                    "the orbit cannot be propagated: it comes too near the Earth's centre or is not finite",
+                    limit="step of the integration",
+                )
         found.append((np.array(new_steps), np.array(new_tables)))
     size = step.size
-    orbit = DenseOrbit(np.array(times), np.array(values), np.array(starts).reshape(-1, size),
-                       np.array(dense).reshape(-1, 7, size), step.state, step.columns)
+    orbit = DenseOrbit(
+        np.array(times),
+        np.array(values),
+        np.array(starts).reshape(-1, size),
+        np.array(dense).reshape(-1, 7, size),
+        step.state,
+        step.columns,
+    )
     return orbit, Grid(tuple(found))
 
 
@@ -286,8 +313,9 @@ class _Runner:
         """Right side of the equations: what a step of length zero ends with."""
         return self.advance(y, np.zeros(self.size), np.repeat(np.asarray(u)[:, None], _STAGES, axis=1), 0.0)[1]
 
-    def advance(self, y: np.ndarray, k: np.ndarray, table: np.ndarray,
-                h: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def advance(
+        self, y: np.ndarray, k: np.ndarray, table: np.ndarray, h: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         after, slope, dense = np.empty(self.size), np.empty(self.size), np.empty((7, self.size))
         fifth, third = np.empty(self.state), np.empty(self.state)
         columns = np.ascontiguousarray(table.T)

@@ -135,8 +135,9 @@ class _Extension:
         cosine, sine = larger.cosine.copy(), larger.sine.copy()
         cosine[: degree + 1, : degree + 1] = 0.0
         sine[: degree + 1, : degree + 1] = 0.0
-        self.field = GravityField(f"{larger.name} above {degree}", larger.gravitational_parameter, larger.radius,
-                                  cosine, sine)
+        self.field = GravityField(
+            f"{larger.name} above {degree}", larger.gravitational_parameter, larger.radius, cosine, sine
+        )
 
     def __call__(self, s: MotionSample, p: Matrix) -> Matrix:
         acceleration, _ = gravity(ca.mtimes(s.earth_fixed_from_celestial, s.position), self.field)
@@ -181,8 +182,9 @@ class Motion:
 _MOTIONS: dict[Any, Motion] = {}
 
 
-def motion(field: GravityField, accelerations: Sequence[Acceleration], active: Sequence[str],
-           area_over_mass: float) -> Motion:
+def motion(
+    field: GravityField, accelerations: Sequence[Acceleration], active: Sequence[str], area_over_mass: float
+) -> Motion:
     """The equations of motion, compiled once per set.
 
     Args:
@@ -203,8 +205,17 @@ def motion(field: GravityField, accelerations: Sequence[Acceleration], active: S
     def derivative(x: ca.SX, p: ca.SX, u: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
         rotation = ca.reshape(u[:9], 3, 3)
         sample = MotionSample(
-            time=u[15], position=x[:3], velocity=x[3:], sun=u[9:12], moon=u[12:15], earth_fixed_from_celestial=rotation,
-            spin=EARTH_ROTATION_RATE * rotation[2, :].T, area_over_mass=area_over_mass, thrust=u[16:19], field=field)
+            time=u[15],
+            position=x[:3],
+            velocity=x[3:],
+            sun=u[9:12],
+            moon=u[12:15],
+            earth_fixed_from_celestial=rotation,
+            spin=EARTH_ROTATION_RATE * rotation[2, :].T,
+            area_over_mass=area_over_mass,
+            thrust=u[16:19],
+            field=field,
+        )
         pull, gradient = gravity(ca.mtimes(rotation, x[:3]), field)
         other = ca.SX.zeros(3)
         for a in accelerations:
@@ -216,8 +227,9 @@ def motion(field: GravityField, accelerations: Sequence[Acceleration], active: S
         along_p = ca.vertcat(ca.SX(3, p.shape[0]), ca.jacobian(other, p))
         return ca.vertcat(x[3:], total), along_x, along_p
 
-    made = Motion(VariationalStep("orbit", derivative, 6, at, INPUTS, indices), tuple(accelerations), slices,
-                  tuple(active))
+    made = Motion(
+        VariationalStep("orbit", derivative, 6, at, INPUTS, indices), tuple(accelerations), slices, tuple(active)
+    )
     _MOTIONS[key] = made
     return made
 
@@ -230,7 +242,8 @@ def motion_inputs(environment: SpaceEnvironment, burns: Sequence[Burn] = ()) -> 
         thrust = np.zeros((len(time), 3))
         for burn in burns:
             thrust[(time > burn.start) & (time < burn.stop)] += burn.acceleration
-        return np.column_stack([rotation.transpose(0, 2, 1).reshape(-1, 9), environment.sun(time),
-                                environment.moon(time), time, thrust])
+        return np.column_stack(
+            [rotation.transpose(0, 2, 1).reshape(-1, 9), environment.sun(time), environment.moon(time), time, thrust]
+        )
 
     return inputs

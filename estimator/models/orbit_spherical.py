@@ -1,7 +1,8 @@
 """Motion near the stationary orbit in spherical coordinates, its linearization in closed form, and shaping filters.
 
-State: distance r (m), right ascension (rad), declination (rad) and their rates. The satellite feels the central field and a
-thrust acceleration perpendicular to the radius and parallel to the equator (the book's equations 3.59 and 3.61).
+State: distance r (m), right ascension (rad), declination (rad) and their rates. The satellite feels the central
+field and a thrust acceleration perpendicular to the radius and parallel to the equator (the book's equations 3.59
+and 3.61).
 """
 
 from __future__ import annotations
@@ -12,15 +13,23 @@ import numpy as np
 from estimator.models.earth import GRAVITATIONAL_PARAMETER
 from estimator.models.rotations import Matrix
 
-STATE_NAMES = ("distance", "right ascension", "declination", "distance rate", "right ascension rate",
-               "declination rate")
+STATE_NAMES = (
+    "distance",
+    "right ascension",
+    "declination",
+    "distance rate",
+    "right ascension rate",
+    "declination rate",
+)
 
 
 def spherical_rates(state: Matrix, thrust: Matrix = 0.0) -> Matrix:
     """Derivative (6) of the spherical state (6) with thrust acceleration (m/s2), equation 3.61."""
     r, d, vr, va, vd = state[0], state[2], state[3], state[4], state[5]
     return ca.vertcat(
-        vr, va, vd,
+        vr,
+        va,
+        vd,
         r * va**2 * ca.cos(d) ** 2 + r * vd**2 - GRAVITATIONAL_PARAMETER / r**2,
         -2 * vr * va / r + 2 * va * vd * ca.tan(d) + thrust / (r * ca.cos(d)),
         -2 * vr * vd / r - va**2 * ca.sin(d) * ca.cos(d),
@@ -72,14 +81,16 @@ def stationary_transition(radius: float, rate: float, interval: float) -> np.nda
     """
     r0, n, t = radius, rate, interval
     s, c = np.sin(n * t), np.cos(n * t)
-    return np.array([
-        [4 - 3 * c, 0, 0, s / n, 2 * r0 * (1 - c) / n, 0],
-        [6 * (s - n * t) / r0, 1, 0, -2 * (1 - c) / (n * r0), 4 * s / n - 3 * t, 0],
-        [0, 0, c, 0, 0, s / n],
-        [3 * n * s, 0, 0, c, 2 * r0 * s, 0],
-        [6 * n * (c - 1) / r0, 0, 0, -2 * s / r0, 4 * c - 3, 0],
-        [0, 0, -n * s, 0, 0, c],
-    ])
+    return np.array(
+        [
+            [4 - 3 * c, 0, 0, s / n, 2 * r0 * (1 - c) / n, 0],
+            [6 * (s - n * t) / r0, 1, 0, -2 * (1 - c) / (n * r0), 4 * s / n - 3 * t, 0],
+            [0, 0, c, 0, 0, s / n],
+            [3 * n * s, 0, 0, c, 2 * r0 * s, 0],
+            [6 * n * (c - 1) / r0, 0, 0, -2 * s / r0, 4 * c - 3, 0],
+            [0, 0, -n * s, 0, 0, c],
+        ]
+    )
 
 
 def thrust_transition(radius: float, rate: float, interval: float, decay: float = 0.0) -> np.ndarray:
@@ -90,8 +101,16 @@ def thrust_transition(radius: float, rate: float, interval: float, decay: float 
     r0, n, t, a = radius, rate, interval, decay
     s, c = np.sin(n * t), np.cos(n * t)
     if a * t < 1e-6:
-        return np.array([2 * (n * t - s) / n**2, (4 * (1 - c) / n**2 - 1.5 * t**2) / r0, 0.0, 2 * (1 - c) / n,
-                         (4 * s / n - 3 * t) / r0, 0.0])
+        return np.array(
+            [
+                2 * (n * t - s) / n**2,
+                (4 * (1 - c) / n**2 - 1.5 * t**2) / r0,
+                0.0,
+                2 * (1 - c) / n,
+                (4 * s / n - 3 * t) / r0,
+                0.0,
+            ]
+        )
     e, k = np.exp(-a * t), n**2 / (a**2 + n**2)
     scale = 2 / (a * n)
     distance = scale * ((1 - c) - k * (e - c + a / n * s))

@@ -1,8 +1,8 @@
 """Tracking measurements of a satellite from the ground, as pure CasADi functions of one measurement.
 
 Range (half the sum of the two legs, or the sum), its rate, azimuth and elevation, and the direction cosines of the
-line of sight towards north and east. :class:`Corrections` collects everything that may be wrong with a station, all zero
-where nothing is; the batch, the filters and the effects of the discrepancy workflow use the same functions.
+line of sight towards north and east. :class:`Corrections` collects everything that may be wrong with a station, all
+zero where nothing is; the batch, the filters and the effects of the discrepancy workflow use the same functions.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ SIZES: dict[str, int] = {"range": 1, "range_rate": 1, "azimuth_elevation": 2, "d
 """Numbers in one measurement of each kind."""
 UNITS: dict[str, str] = {"range": "m", "range_rate": "m/s", "azimuth_elevation": "rad", "direction_cosines": "1"}
 COMPONENTS: dict[str, tuple[str, ...]] = {
-    "range": ("range",), "range_rate": ("range_rate",), "azimuth_elevation": ("azimuth", "elevation"),
+    "range": ("range",),
+    "range_rate": ("range_rate",),
+    "azimuth_elevation": ("azimuth", "elevation"),
     "direction_cosines": ("cosine_north", "cosine_east"),
 }
 """Names of the numbers in one measurement."""
@@ -80,21 +82,44 @@ class Corrections:
     earth_angle: Matrix = 0.0
 
 
-def _path(state: Matrix, earth: Earth, transmitter: Antenna, receiver: Antenna, signalling: Signalling,
-          corrections: Corrections, same: bool) -> tuple[Path, Earth, Antenna]:
+def _path(
+    state: Matrix,
+    earth: Earth,
+    transmitter: Antenna,
+    receiver: Antenna,
+    signalling: Signalling,
+    corrections: Corrections,
+    same: bool,
+) -> tuple[Path, Earth, Antenna]:
     earth = Earth(earth.intermediate, earth.angle + corrections.earth_angle, earth.pole)
     place, sender = receiver.position, transmitter.position
     if corrections.station is not None:
         place = place + ca.mtimes(receiver.east_north_up.T, corrections.station)
         sender = place if same else sender
     base = 1.0 if signalling.light_time else 0.0
-    path = signal_path(state, earth, sender, place, tag=signalling.tag, offset=corrections.time_tag,
-                       light_time=base + corrections.light_time)
+    path = signal_path(
+        state,
+        earth,
+        sender,
+        place,
+        tag=signalling.tag,
+        offset=corrections.time_tag,
+        light_time=base + corrections.light_time,
+    )
     return path, earth, Antenna(place, receiver.east_north_up, receiver.altitude)
 
 
-def predicted(kind: Kind, state: Matrix, earth: Earth, transmitter: Antenna, receiver: Antenna,
-              signalling: Signalling, corrections: Corrections, *, same: bool) -> Matrix:
+def predicted(
+    kind: Kind,
+    state: Matrix,
+    earth: Earth,
+    transmitter: Antenna,
+    receiver: Antenna,
+    signalling: Signalling,
+    corrections: Corrections,
+    *,
+    same: bool,
+) -> Matrix:
     """The measurement that the model predicts, SI and radians.
 
     Args:

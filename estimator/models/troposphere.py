@@ -50,6 +50,11 @@ def refraction(elevation: Matrix, altitude: Matrix) -> Matrix:
     """
     e = ca.fmax(elevation * 180 / np.pi, -1.0)
     h = altitude * 1e-3
-    inverse = (1.728 + 0.5411 * e + 0.03723 * e * e + h * (0.1815 + 0.06272 * e + 0.01380 * e * e)
-               + h * h * (0.01727 + 0.008288 * e))
+    inverse = (
+        1.728
+        + 0.5411 * e
+        + 0.03723 * e * e
+        + h * (0.1815 + 0.06272 * e + 0.01380 * e * e)
+        + h * h * (0.01727 + 0.008288 * e)
+    )
     return np.pi / 180 / inverse

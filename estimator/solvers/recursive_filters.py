@@ -1,4 +1,5 @@
-"""Recursive filters over one discrete system: linear, extended, iterated, unscented, Schmidt, square-root, and smoothers.
+"""Recursive filters over one discrete system: linear, extended, iterated, unscented, Schmidt, square-root, and
+smoothers.
 
 Every function runs many realizations at once: states are (runs, size), measurements (runs, steps, outputs). The system
 gives its propagation and its measurement with their Jacobians, from the same kernels as the batch. A filter says when
@@ -86,16 +87,19 @@ class FilterRun:
         if bad == 0:
             return f"{self.name}: the innovations agree with the filter's covariance in all {runs} runs"
         ratio = float(np.nanmedian(self.innovation_square.mean(axis=1)[self.diverged()] / self.outputs))
-        return (f"{self.name}: diverged in {bad} of {runs} runs (innovations {np.sqrt(ratio):.3g} times the filter's own "
-                "sigma): its errors grow while its covariance shrinks")
+        return (
+            f"{self.name}: diverged in {bad} of {runs} runs (innovations {np.sqrt(ratio):.3g} times the filter's own "
+            "sigma): its errors grow while its covariance shrinks"
+        )
 
 
 def _symmetric(matrix: np.ndarray) -> np.ndarray:
     return 0.5 * (matrix + np.swapaxes(matrix, -1, -2))
 
 
-def _start(system: DiscreteSystem, state: np.ndarray, covariance: np.ndarray,
-           measurements: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _start(
+    system: DiscreteSystem, state: np.ndarray, covariance: np.ndarray, measurements: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     runs = len(measurements)
     x = np.broadcast_to(state, (runs, system.size)).copy()
     p = np.broadcast_to(covariance, (runs, system.size, system.size)).copy()
@@ -120,8 +124,14 @@ def _square(innovation: np.ndarray, s: np.ndarray) -> np.ndarray:
     return np.einsum("ri,ri->r", innovation, np.linalg.solve(s, innovation[..., None])[..., 0])
 
 
-def linear_filter(system: DiscreteSystem, nominal: np.ndarray, transition: Sequence[np.ndarray] | np.ndarray,
-                  state: np.ndarray, covariance: np.ndarray, measurements: np.ndarray) -> FilterRun:
+def linear_filter(
+    system: DiscreteSystem,
+    nominal: np.ndarray,
+    transition: Sequence[np.ndarray] | np.ndarray,
+    state: np.ndarray,
+    covariance: np.ndarray,
+    measurements: np.ndarray,
+) -> FilterRun:
     """Kalman's filter of the deviation from a nominal motion that is never corrected.
 
     Args:
@@ -148,12 +158,21 @@ def linear_filter(system: DiscreteSystem, nominal: np.ndarray, transition: Seque
         p = _joseph(p, gain, h, r)
         states[:, k + 1] = nominal[k + 1] + deviation
         sigmas[:, k + 1] = np.sqrt(np.diagonal(p, axis1=1, axis2=2))
-    return FilterRun("linear", states, sigmas, np.broadcast_to(p, (len(x), *p.shape[1:])).copy(), squares,
-                     measurements.shape[2])
+    return FilterRun(
+        "linear", states, sigmas, np.broadcast_to(p, (len(x), *p.shape[1:])).copy(), squares, measurements.shape[2]
+    )
 
 
-def extended_filter(system: DiscreteSystem, state: np.ndarray, covariance: np.ndarray, measurements: np.ndarray, *,
-                    iterations: int = 1, keep: bool = False, about: np.ndarray | None = None) -> FilterRun:
+def extended_filter(
+    system: DiscreteSystem,
+    state: np.ndarray,
+    covariance: np.ndarray,
+    measurements: np.ndarray,
+    *,
+    iterations: int = 1,
+    keep: bool = False,
+    about: np.ndarray | None = None,
+) -> FilterRun:
     """The extended filter, and with ``iterations`` above one the iterated one (Gauss-Newton steps in each update).
 
     Args:
@@ -195,8 +214,15 @@ def extended_filter(system: DiscreteSystem, state: np.ndarray, covariance: np.nd
     return FilterRun(name, states, sigmas, p, squares, measurements.shape[2], kept)
 
 
-def schmidt_filter(system: DiscreteSystem, state: np.ndarray, covariance: np.ndarray, measurements: np.ndarray,
-                   considered: Sequence[int], *, iterations: int = 1) -> FilterRun:
+def schmidt_filter(
+    system: DiscreteSystem,
+    state: np.ndarray,
+    covariance: np.ndarray,
+    measurements: np.ndarray,
+    considered: Sequence[int],
+    *,
+    iterations: int = 1,
+) -> FilterRun:
     """Schmidt's filter: the components ``considered`` widen the covariance and are not estimated."""
     x, p, states, sigmas, squares = _start(system, state, covariance, measurements)
     r = system.measurement_covariance
@@ -221,14 +247,15 @@ def schmidt_filter(system: DiscreteSystem, state: np.ndarray, covariance: np.nda
     return FilterRun("Schmidt", states, sigmas, p, squares, measurements.shape[2])
 
 
-def square_root_filter(system: DiscreteSystem, state: np.ndarray, covariance: np.ndarray, measurements: np.ndarray, *,
-                       iterations: int = 1) -> FilterRun:
+def square_root_filter(
+    system: DiscreteSystem, state: np.ndarray, covariance: np.ndarray, measurements: np.ndarray, *, iterations: int = 1
+) -> FilterRun:
     """The extended filter with a triangular factor of the covariance, by orthogonal transformations (Kaminski 1971).
 
-    The factor cannot lose symmetry or positive definiteness, and carries twice the digits of the covariance. The prior and
-    the process noise may be singular.
+    The factor cannot lose symmetry or positive definiteness, and carries twice the digits of the covariance. The
+    prior and the process noise may be singular.
     """
-    x, p, states, sigmas, squares = _start(system, state, covariance, measurements)
+    x, _, states, sigmas, squares = _start(system, state, covariance, measurements)
     runs, size = len(x), system.size
     outputs = measurements.shape[2]
     scale = np.sqrt(np.maximum(np.diag(covariance if covariance.ndim == 2 else covariance[0]), 1e-300))
@@ -250,8 +277,10 @@ def square_root_filter(system: DiscreteSystem, state: np.ndarray, covariance: np
             pre[:, outputs:, :outputs] = np.swapaxes(h @ root, -1, -2)
             pre[:, outputs:, outputs:] = np.swapaxes(root, -1, -2)
             post: np.ndarray = np.asarray(np.linalg.qr(pre, mode="r"))
-            s_root, cross = np.swapaxes(post[:, :outputs, :outputs], -1, -2), np.swapaxes(post[:, :outputs, outputs:], -1,
-                                                                                         -2)
+            s_root, cross = (
+                np.swapaxes(post[:, :outputs, :outputs], -1, -2),
+                np.swapaxes(post[:, :outputs, outputs:], -1, -2),
+            )
             innovation = measurements[:, k] - predicted - np.einsum("rij,rj->ri", h, x - point)
             white = np.linalg.solve(s_root, innovation[..., None])[..., 0]
             if i == 0:
@@ -271,8 +300,16 @@ def _root(matrix: np.ndarray, scale: np.ndarray) -> np.ndarray:
     return scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
 
 
-def unscented_filter(system: DiscreteSystem, state: np.ndarray, covariance: np.ndarray, measurements: np.ndarray, *,
-                     spread: float = 1.0, fourth: float = 2.0, excess: float | None = None) -> FilterRun:
+def unscented_filter(
+    system: DiscreteSystem,
+    state: np.ndarray,
+    covariance: np.ndarray,
+    measurements: np.ndarray,
+    *,
+    spread: float = 1.0,
+    fourth: float = 2.0,
+    excess: float | None = None,
+) -> FilterRun:
     """The unscented filter (Julier and Uhlmann 1997, scaled form of Wan and van der Merwe 2000).
 
     Args:
@@ -337,18 +374,30 @@ def smoothed(run: FilterRun) -> FilterRun:
         before = h["covariance"][:, k] @ np.swapaxes(h["phi"][:, k], -1, -2)
         scale = np.sqrt(np.maximum(np.diagonal(h["predicted_covariance"][:, k], axis1=1, axis2=2), 1e-300))
         inner = h["predicted_covariance"][:, k] / (scale[:, :, None] * scale[:, None, :])
-        gain = np.swapaxes(np.linalg.solve(inner, np.swapaxes(before / scale[:, None, :], -1, -2)), -1,
-                           -2) / scale[:, None, :]
+        gain = (
+            np.swapaxes(np.linalg.solve(inner, np.swapaxes(before / scale[:, None, :], -1, -2)), -1, -2)
+            / scale[:, None, :]
+        )
         state[:, k] = run.state[:, k] + np.einsum("rij,rj->ri", gain, state[:, k + 1] - h["predicted"][:, k])
-        covariance[:, k] = _symmetric(h["covariance"][:, k] + gain @ (
-            covariance[:, k + 1] - h["predicted_covariance"][:, k]) @ np.swapaxes(gain, -1, -2))
+        covariance[:, k] = _symmetric(
+            h["covariance"][:, k]
+            + gain @ (covariance[:, k + 1] - h["predicted_covariance"][:, k]) @ np.swapaxes(gain, -1, -2)
+        )
     sigma = np.sqrt(np.maximum(np.diagonal(covariance, axis1=2, axis2=3), 0.0))
     return FilterRun(f"smoother of {run.name}", state, sigma, covariance[:, 0], run.innovation_square, run.outputs)
 
 
-def iterated_smoother(system: DiscreteSystem, state: np.ndarray, covariance: np.ndarray, measurements: np.ndarray, *,
-                      passes: int = 5, tolerance: float = 1e-3) -> FilterRun:
-    """Smoothing passes, each linearized about the last smoothed motion, until it moves by less than ``tolerance`` sigma.
+def iterated_smoother(
+    system: DiscreteSystem,
+    state: np.ndarray,
+    covariance: np.ndarray,
+    measurements: np.ndarray,
+    *,
+    passes: int = 5,
+    tolerance: float = 1e-3,
+) -> FilterRun:
+    """Smoothing passes, each linearized about the last smoothed motion, until it moves by less than ``tolerance``
+    sigma.
 
     Its fixed point is the maximum of the posterior, the same as the joint batch's (Bell 1994).
     """

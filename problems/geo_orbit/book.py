@@ -1,7 +1,8 @@
 """The system of the book: 14 components, its simulation scheme (figure 3.2) and its numbers.
 
-Which question: how well does each filter follow a satellite near the stationary orbit from one station's total range, its
-rate and two direction cosines, with the thrust's error, the station's place and four systematic errors unknown too?
+Which question: how well does each filter follow a satellite near the stationary orbit from one station's total
+range, its rate and two direction cosines, with the thrust's error, the station's place and four systematic errors
+unknown too?
 
 State (14): distance, right ascension, declination and their rates; error of the thrust acceleration; station longitude,
 latitude and altitude; systematic errors of range, range rate and the cosines to north and east. Sigmas that the book
@@ -34,9 +35,22 @@ from estimator.models.rotations import Matrix
 from estimator.models.station import earth_fixed_position
 
 SIZE, OUTPUTS = 14, 4
-NAMES = ("distance", "right ascension", "declination", "distance rate", "right ascension rate", "declination rate",
-         "thrust error", "longitude", "latitude", "altitude", "range error", "range rate error", "north cosine error",
-         "east cosine error")
+NAMES = (
+    "distance",
+    "right ascension",
+    "declination",
+    "distance rate",
+    "right ascension rate",
+    "declination rate",
+    "thrust error",
+    "longitude",
+    "latitude",
+    "altitude",
+    "range error",
+    "range rate error",
+    "north cosine error",
+    "east cosine error",
+)
 PERIOD = 86164.0  # s, the book's
 
 
@@ -105,10 +119,20 @@ class BookCase:
         r = p / (1 + e * np.cos(nu))
         speed = np.sqrt(GRAVITATIONAL_PARAMETER / p)
         node, ci, si = self.node, np.cos(i), np.sin(i)
-        radial = np.array([np.cos(node) * np.cos(u) - np.sin(node) * np.sin(u) * ci,
-                           np.sin(node) * np.cos(u) + np.cos(node) * np.sin(u) * ci, np.sin(u) * si])
-        along = np.array([-np.cos(node) * np.sin(u) - np.sin(node) * np.cos(u) * ci,
-                          -np.sin(node) * np.sin(u) + np.cos(node) * np.cos(u) * ci, np.cos(u) * si])
+        radial = np.array(
+            [
+                np.cos(node) * np.cos(u) - np.sin(node) * np.sin(u) * ci,
+                np.sin(node) * np.cos(u) + np.cos(node) * np.sin(u) * ci,
+                np.sin(u) * si,
+            ]
+        )
+        along = np.array(
+            [
+                -np.cos(node) * np.sin(u) - np.sin(node) * np.cos(u) * ci,
+                -np.sin(node) * np.sin(u) + np.cos(node) * np.cos(u) * ci,
+                np.cos(u) * si,
+            ]
+        )
         velocity = speed * e * np.sin(nu) * radial + speed * (1 + e * np.cos(nu)) * along
         spherical = np.asarray(ca.DM(spherical_from_cartesian(ca.DM(np.concatenate([r * radial, velocity]))))).ravel()
         return np.array([*spherical, 0.0, *self.station, 0.0, 0.0, 0.0, 0.0])
@@ -129,8 +153,10 @@ def measurement(x: Matrix, greenwich: Matrix) -> Matrix:
     antenna = Antenna(place, axes, x[9])
     how = Signalling("reception", "sum", troposphere=False, bending=False)
     none = Corrections()
-    values = [predicted(kind, state, earth, antenna, antenna, how, none, same=True)
-              for kind in ("range", "range_rate", "direction_cosines")]
+    values = [
+        predicted(kind, state, earth, antenna, antenna, how, none, same=True)
+        for kind in ("range", "range_rate", "direction_cosines")
+    ]
     return ca.vertcat(*values) + x[10:14]
 
 
@@ -145,11 +171,20 @@ def _kernels() -> tuple[Mapped, Mapped]:
     k3 = spherical_rates(y + t / 2 * k2, thrust)
     k4 = spherical_rates(y + t * k3, thrust)
     after = ca.vertcat(y + t / 6 * (k1 + 2 * k2 + 2 * k3 + k4), factor[0] * x[6], x[7:10], factor[1:5] * x[10:14])
-    move = compiled(ca.Function("book_move", [x, nominal, on, t, factor], [after, ca.densify(ca.jacobian(after, x))],
-                                ["x", "n", "o", "t", "f"], ["y", "phi"]))
+    move = compiled(
+        ca.Function(
+            "book_move",
+            [x, nominal, on, t, factor],
+            [after, ca.densify(ca.jacobian(after, x))],
+            ["x", "n", "o", "t", "f"],
+            ["y", "phi"],
+        )
+    )
     angle = ca.SX.sym("s")
     seen = measurement(x, angle)
-    look = compiled(ca.Function("book_look", [x, angle], [seen, ca.densify(ca.jacobian(seen, x))], ["x", "s"], ["z", "h"]))
+    look = compiled(
+        ca.Function("book_look", [x, angle], [seen, ca.densify(ca.jacobian(seen, x))], ["x", "s"], ["z", "h"])
+    )
     return Mapped(move, ("n", "o", "t", "f")), Mapped(look, ("s",))
 
 
@@ -186,8 +221,14 @@ class BookSystem:
 
     def propagate(self, k: int, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         on = 1.0 if self.burning(k) else 0.0
-        y, phi = _kernels()[0](len(state), x=state, n=np.array([on * self.case.thrust]), o=np.array([on]),
-                               t=np.array([self.case.step]), f=self._shaping[0])
+        y, phi = _kernels()[0](
+            len(state),
+            x=state,
+            n=np.array([on * self.case.thrust]),
+            o=np.array([on]),
+            t=np.array([self.case.step]),
+            f=self._shaping[0],
+        )
         return y, phi
 
     def process_noise(self, k: int) -> np.ndarray:
@@ -237,8 +278,9 @@ class Simulated:
     measurements: np.ndarray
 
 
-def simulate(system: BookSystem, runs: int, seed: int, *, deviation: float = 1.0,
-             kind: Literal["random", "exact"] = "random") -> Simulated:
+def simulate(
+    system: BookSystem, runs: int, seed: int, *, deviation: float = 1.0, kind: Literal["random", "exact"] = "random"
+) -> Simulated:
     """Draw realizations: first state, shaping filters, measurement noise.
 
     Args:
@@ -246,8 +288,8 @@ def simulate(system: BookSystem, runs: int, seed: int, *, deviation: float = 1.0
         runs: realizations.
         seed: of the random numbers.
         deviation: factor of the prior sigmas in the draw of the first state (the filters are not told).
-        kind: "random" draws every component; "exact" sets each orbit component ``deviation`` sigma away, sign by chance,
-            which is what the book's figures show.
+        kind: "random" draws every component; "exact" sets each orbit component ``deviation`` sigma away, sign by
+            chance, which is what the book's figures show.
     """
     random = np.random.default_rng(seed)
     case = system.case
@@ -296,4 +338,3 @@ def cramer_rao(system: BookSystem, truth: np.ndarray) -> np.ndarray:
         rows = weight[:, None] * (h[0] @ phi)
         information += rows.T @ rows
     return np.linalg.inv(information) * np.outer(prior, prior)
-

@@ -1,7 +1,8 @@
-"""The book's 14 unknowns in one joint least-squares problem of the engine: orbit, thrust error, station, systematic errors.
+"""The book's 14 unknowns in one joint least-squares problem of the engine: orbit, thrust error, station, systematic
+errors.
 
-The measurement functions are those of the filters. Without process noise (an infinite correlation interval) its estimate
-is the maximum of the posterior, and its covariance reaches the Cramer-Rao bound.
+The measurement functions are those of the filters. Without process noise (an infinite correlation interval) its
+estimate is the maximum of the posterior, and its covariance reaches the Cramer-Rao bound.
 """
 
 from __future__ import annotations
@@ -34,8 +35,10 @@ GROUPS: tuple[tuple[str, slice, tuple[str, ...], str], ...] = (
 
 
 def _unknowns(prior: np.ndarray, with_prior: bool) -> dict[str, Unknown]:
-    return {name: Unknown(name, Vector(len(labels), labels), unit, tuple(prior[part]), prior=with_prior)
-            for name, part, labels, unit in GROUPS}
+    return {
+        name: Unknown(name, Vector(len(labels), labels), unit, tuple(prior[part]), prior=with_prior)
+        for name, part, labels, unit in GROUPS
+    }
 
 
 @lru_cache(maxsize=8)
@@ -52,12 +55,14 @@ def _kernel(station: Unknown, errors: Unknown) -> Kernel:
         x = ca.vertcat(seen["state"], 0, seen["station"], seen["systematic_errors"])
         return seen["measured"] - measurement(x, seen["angle"])
 
-    return Kernel("book_measurement", [station, errors], [("state", Vector(6))], [("measured", OUTPUTS), ("angle", 1)], [],
-                  build)
+    return Kernel(
+        "book_measurement", [station, errors], [("state", Vector(6))], [("measured", OUTPUTS), ("angle", 1)], [], build
+    )
 
 
-def batch_problem(system: BookSystem, measurements: np.ndarray, *, with_prior: bool = True,
-                  loss: Loss | None = None) -> Problem:
+def batch_problem(
+    system: BookSystem, measurements: np.ndarray, *, with_prior: bool = True, loss: Loss | None = None
+) -> Problem:
     """The joint problem of one realization.
 
     Args:
@@ -72,20 +77,40 @@ def batch_problem(system: BookSystem, measurements: np.ndarray, *, with_prior: b
     """
     case = system.case
     if np.isfinite(case.interval) or system.inflation:
-        raise RequestError("the joint batch takes systematic errors as constants", where="interval",
-                           value=case.interval, limit="infinite",
-                           remedy="use the iterated smoother, which estimates the same with process noise")
+        raise RequestError(
+            "the joint batch takes systematic errors as constants",
+            where="interval",
+            value=case.interval,
+            limit="infinite",
+            remedy="use the iterated smoother, which estimates the same with process noise",
+        )
     unknowns = _unknowns(case.prior, with_prior)
     time = np.arange(system.steps + 1) * case.step
     on = np.array([1.0 if system.burning(k) else 0.0 for k in range(system.steps)])
     flow = _flow(unknowns["thrust_error"])
-    signal = PropagatedSignal("state", flow, (unknowns["orbit"],), time, np.zeros((len(time), 0)),
-                              np.column_stack([case.thrust * on, on]), np.arange(1, len(time)))
+    signal = PropagatedSignal(
+        "state",
+        flow,
+        (unknowns["orbit"],),
+        time,
+        np.zeros((len(time), 0)),
+        np.column_stack([case.thrust * on, on]),
+        np.arange(1, len(time)),
+    )
     angle = case.greenwich + EARTH_ROTATION_RATE * time[1:]
     residual = KernelResidual(
-        "station", "tracking", "m, m/s, 1", _kernel(unknowns["station"], unknowns["systematic_errors"]), (signal,),
-        {"measured": measurements, "angle": angle[:, None]}, np.tile(case.sigma_noise, (system.steps, 1)), time[1:],
-        np.zeros(system.steps, dtype=int), ("station",), loss=loss or Quadratic())
+        "station",
+        "tracking",
+        "m, m/s, 1",
+        _kernel(unknowns["station"], unknowns["systematic_errors"]),
+        (signal,),
+        {"measured": measurements, "angle": angle[:, None]},
+        np.tile(case.sigma_noise, (system.steps, 1)),
+        time[1:],
+        np.zeros(system.steps, dtype=int),
+        ("station",),
+        loss=loss or Quadratic(),
+    )
     first = case.first_state
     start = {name: first[part] for name, part, _, _ in GROUPS}
     held = frozenset() if on.any() else frozenset({"thrust_error"})
@@ -116,8 +141,14 @@ def _from(problem: Problem, values: dict[str, np.ndarray], options: Options) -> 
 
 @lru_cache(maxsize=8)
 def _prior_kernel(unknown: Unknown) -> Kernel:
-    return Kernel(f"prior_{unknown.name}", [unknown], [], [("measured", unknown.manifold.tangent)], [],
-                  lambda seen: seen["measured"] - seen[unknown.name])
+    return Kernel(
+        f"prior_{unknown.name}",
+        [unknown],
+        [],
+        [("measured", unknown.manifold.tangent)],
+        [],
+        lambda seen: seen["measured"] - seen[unknown.name],
+    )
 
 
 def with_prior_residuals(problem: Problem) -> Problem:
@@ -131,10 +162,20 @@ def with_prior_residuals(problem: Problem) -> Problem:
         plain = replace(u, prior=False)
         unknowns.append(plain)
         if u.prior and u.name in free:
-            residuals.append(KernelResidual(
-                f"prior of {u.name}", "prior", u.unit, _prior_kernel(plain), (),
-                {"measured": np.asarray(problem.start[u.name])[None, :]}, u.scales[None, :], np.zeros(1),
-                np.zeros(1, dtype=int), ("prior",)))
+            residuals.append(
+                KernelResidual(
+                    f"prior of {u.name}",
+                    "prior",
+                    u.unit,
+                    _prior_kernel(plain),
+                    (),
+                    {"measured": np.asarray(problem.start[u.name])[None, :]},
+                    u.scales[None, :],
+                    np.zeros(1),
+                    np.zeros(1, dtype=int),
+                    ("prior",),
+                )
+            )
     return replace(problem, unknowns=tuple(unknowns), residuals=tuple(residuals))
 
 

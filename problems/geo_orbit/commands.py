@@ -12,9 +12,13 @@ from problems import console
 
 app = typer.Typer(no_args_is_help=True, help="Orbit determination from ground tracking.")
 
-Files = Annotated[list[Path], typer.Argument(
-    help="tracking data (.aer, .gmd, CCSDS TDM), with settings (.toml, .in), initial orbit (CCSDS OEM, two-line "
-         "elements) and IERS Bulletins B where wanted, in any order")]
+Files = Annotated[
+    list[Path],
+    typer.Argument(
+        help="tracking data (.aer, .gmd, CCSDS TDM), with settings (.toml, .in), initial orbit (CCSDS OEM, two-line "
+        "elements) and IERS Bulletins B where wanted, in any order"
+    ),
+]
 Settings = Annotated[Path | None, typer.Option("--settings", help="stations, forces, orbit: one TOML file")]
 AsJson = Annotated[bool, typer.Option("--json", help="print the answer as JSON")]
 
@@ -44,8 +48,12 @@ def solve_command(
             tracking, chosen = read_files(files, settings)
             bar.update(task, description="solving")
             solution = solve_tracking(
-                tracking, chosen, effects=[e.strip() for e in effects.split(",") if e.strip()], loss=LOSSES[loss],
-                options=Options(progress=lambda i, cost: bar.update(task, description=f"iteration {i}")))
+                tracking,
+                chosen,
+                effects=[e.strip() for e in effects.split(",") if e.strip()],
+                loss=LOSSES[loss],
+                options=Options(progress=lambda i, cost: bar.update(task, description=f"iteration {i}")),
+            )
             if oem is not None:
                 from problems.geo_orbit.ephemeris import ephemeris_of
                 from problems.readers.tracking_ccsds import write_oem
@@ -72,14 +80,19 @@ def explain_command(
         from problems.readers.tracking_files import read_files
 
         if not 0.05 <= hold_out <= 0.5:
-            raise RequestError("the held-out fraction makes no sense", where="--hold-out", value=hold_out,
-                               limit="0.05 to 0.5")
+            raise RequestError(
+                "the held-out fraction makes no sense", where="--hold-out", value=hold_out, limit="0.05 to 0.5"
+            )
         with console.progress() as bar:
             task = bar.add_task("reading", total=None)
             tracking, chosen = read_files(files, settings)
-            found = explained(tracking, chosen, hold_out=hold_out,
-                              without=[n.strip() for n in without.split(",") if n.strip()],
-                              say=lambda text: bar.update(task, description=text, advance=1))
+            found = explained(
+                tracking,
+                chosen,
+                hold_out=hold_out,
+                without=[n.strip() for n in without.split(",") if n.strip()],
+                say=lambda text: bar.update(task, description=text, advance=1),
+            )
         return found.as_dict(), lambda: str(found)
 
     console.run(work, as_json=as_json)

@@ -42,8 +42,9 @@ class OrbitSubject:
     @property
     def effects(self) -> tuple[OrbitEffect, ...]:
         """The library on these data."""
-        return tuple(e for e in instances(self.model.layout)
-                     if e.name not in self.without and e.family not in self.without)
+        return tuple(
+            e for e in instances(self.model.layout) if e.name not in self.without and e.family not in self.without
+        )
 
     @property
     def library(self) -> tuple[EffectInstance, ...]:
@@ -82,9 +83,13 @@ class OrbitExplanation:
         """The machine-readable answer of ``boresight orbit explain``."""
         f = self.findings
         return {
-            "verdict": f.verdict, "why": f.why, "where": _places(f.before),
+            "verdict": f.verdict,
+            "why": f.why,
+            "where": _places(f.before),
             "effects": [self._finding(e) for e in f.findings],
-            "next_measurement": self._next(), "left": _places(f.after), "rejected": list(f.rejected),
+            "next_measurement": self._next(),
+            "left": _places(f.after),
+            "rejected": list(f.rejected),
             "seconds": self.seconds,
         }
 
@@ -94,22 +99,34 @@ class OrbitExplanation:
         channels = [r.channel for r in final.problem.residuals if any(u.name == finding.name for u in r.unknowns)]
         channels = list(dict.fromkeys(channels))
         return {
-            "name": finding.name, "group": list(finding.group), "parameters": _parameters(f_estimate, effect),
-            "score": finding.score, "p_value_after_search": finding.p_value_after_search,
-            "gap_before": _ratio(finding.gap_before, channels), "gap_after": _ratio(finding.gap_after, channels),
+            "name": finding.name,
+            "group": list(finding.group),
+            "parameters": _parameters(f_estimate, effect),
+            "score": finding.score,
+            "p_value_after_search": finding.p_value_after_search,
+            "gap_before": _ratio(finding.gap_before, channels),
+            "gap_after": _ratio(finding.gap_after, channels),
             "held_out_before": _ratio(finding.held_out_before, channels),
             "held_out_after": _ratio(finding.held_out_after, channels),
-            "held_out": {c: {"before": finding.held_out_before[c].rms, "after": finding.held_out_after[c].rms,
-                             "unit": finding.held_out_after[c].unit} for c in channels
-                         if c in finding.held_out_before and c in finding.held_out_after},
+            "held_out": {
+                c: {
+                    "before": finding.held_out_before[c].rms,
+                    "after": finding.held_out_after[c].rms,
+                    "unit": finding.held_out_after[c].unit,
+                }
+                for c in channels
+                if c in finding.held_out_before and c in finding.held_out_after
+            },
             "reference": effect.reference,
         }
 
     def _next(self) -> str:
         unsure = [f for f in self.findings.findings if len(f.group) > 1]
         if unsure:
-            return ("angles or ranges from a station on another continent, over at least one more revolution, to separate "
-                    + " from ".join(unsure[0].group))
+            return (
+                "angles or ranges from a station on another continent, over at least one more revolution, to separate "
+                + " from ".join(unsure[0].group)
+            )
         if self.findings.verdict == "unknown":
             return "more stations and a longer span around the times of the gap"
         return ""
@@ -120,10 +137,15 @@ class OrbitExplanation:
         lines += [f"where: {p['sentence']}" for p in _places(f.before)]
         for e in f.findings:
             d = self._finding(e)
-            lines += ["", f"{d['name']}" + (f" (or {', '.join(g for g in d['group'] if g != d['name'])})"
-                                            if len(d["group"]) > 1 else "")]
-            lines += [f"  {n} = {p['value']:.6g} +- {p['sigma'] if p['sigma'] is not None else float('nan'):.2g} "
-                      f"{p['unit']}" for n, p in d["parameters"].items()]
+            lines += [
+                "",
+                f"{d['name']}"
+                + (f" (or {', '.join(g for g in d['group'] if g != d['name'])})" if len(d["group"]) > 1 else ""),
+            ]
+            lines += [
+                f"  {n} = {p['value']:.6g} +- {p['sigma'] if p['sigma'] is not None else float('nan'):.2g} {p['unit']}"
+                for n, p in d["parameters"].items()
+            ]
             if d["held_out_before"] is not None:
                 lines.append(f"  held-out misfit over noise {d['held_out_before']:.4g} -> {d['held_out_after']:.4g}")
         return "\n".join(lines)
@@ -140,18 +162,36 @@ def _parameters(estimate: Estimate, effect: EffectInstance) -> dict[str, Any]:
     if all(u.name != effect.name for u in estimate.unknowns):
         return {}
     values, sigma = estimate.values[effect.name], estimate.sigma_of(effect.name)
-    return {p.name: {"value": float(v), "sigma": float(s) if np.isfinite(s) else None, "unit": p.unit}
-            for p, v, s in zip(effect.parameters, values, sigma, strict=True)}
+    return {
+        p.name: {"value": float(v), "sigma": float(s) if np.isfinite(s) else None, "unit": p.unit}
+        for p, v, s in zip(effect.parameters, values, sigma, strict=True)
+    }
 
 
 def _places(gap: Gap) -> list[dict[str, Any]]:
-    return [{"channel": p.channel, "arcs": list(p.arcs), "time_scale_s": p.time_scale, "unit": p.unit,
-             "excess": p.excess, "components": list(p.components), "p_value": p.p_value, "sentence": p.sentence}
-            for p in gap.places]
+    return [
+        {
+            "channel": p.channel,
+            "arcs": list(p.arcs),
+            "time_scale_s": p.time_scale,
+            "unit": p.unit,
+            "excess": p.excess,
+            "components": list(p.components),
+            "p_value": p.p_value,
+            "sentence": p.sentence,
+        }
+        for p in gap.places
+    ]
 
 
-def explained(tracking: Tracking, settings: OrbitSettings, *, hold_out: float = 0.2, without: Sequence[str] = (),
-              say: Say | None = None) -> OrbitExplanation:
+def explained(
+    tracking: Tracking,
+    settings: OrbitSettings,
+    *,
+    hold_out: float = 0.2,
+    without: Sequence[str] = (),
+    say: Say | None = None,
+) -> OrbitExplanation:
     """Find what the model of the settings misses in tracking data.
 
     Args:

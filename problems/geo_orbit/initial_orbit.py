@@ -1,8 +1,8 @@
 """A first orbit to start the joint fit, from two-line elements or from the data alone.
 
 From the data: positions from range with azimuth and elevation of one station, else from three or more ranges at the
-same time, else the stationary longitude that fits best; then the two-body orbit through the positions by least squares over
-a horizon that grows from a part of a revolution to all data.
+same time, else the stationary longitude that fits best; then the two-body orbit through the positions by least
+squares over a horizon that grows from a part of a revolution to all data.
 """
 
 from __future__ import annotations
@@ -61,8 +61,9 @@ def state_of_elements(lines: tuple[str, str], epoch: np.datetime64) -> tuple[np.
     date, clock = text.split("T")
     year, month, day = (int(w) for w in date.split("-"))
     hour, minute, second = clock.split(":")
-    instant = brahe.Epoch.from_datetime(year, month, day, int(hour), int(minute), float(second), 0.0,
-                                        brahe.TimeSystem.TAI)  # type: ignore[arg-type]
+    instant = brahe.Epoch.from_datetime(
+        year, month, day, int(hour), int(minute), float(second), 0.0, brahe.TimeSystem.TAI
+    )  # type: ignore[arg-type]
     teme = np.asarray(propagator.state(instant))
     days = float((epoch - np.datetime64("2000-01-01T12:00:00", "us")) / np.timedelta64(1, "us")) / 86400e6
     tt = days + 32.184 / 86400  # day
@@ -80,8 +81,11 @@ def _from_angles(model: OrbitModel) -> tuple[np.ndarray, np.ndarray] | None:
     for o in model.tracking.observations:
         if o.kind != "range" or o.receiver != o.transmitter:
             continue
-        angles = [a for a in model.tracking.observations
-                  if a.kind in ("azimuth_elevation", "direction_cosines") and a.receiver == o.receiver]
+        angles = [
+            a
+            for a in model.tracking.observations
+            if a.kind in ("azimuth_elevation", "direction_cosines") and a.receiver == o.receiver
+        ]
         station = model.station(o.receiver)
         origin = station_position(station.latitude, station.longitude, station.altitude)
         axes = east_north_up(station.latitude, station.longitude)
@@ -129,8 +133,10 @@ def _from_ranges(model: OrbitModel) -> tuple[np.ndarray, np.ndarray] | None:
             s = model.station(o.receiver)
             origin = station_position(s.latitude, s.longitude, s.altitude)
             bias = s.bias.get("range", 0.0)
-            rows += [(t, *origin, (v - model.settings.onboard_range_bias) / legs - bias)
-                     for t, v in zip(model.seconds(o.time), o.value[:, 0], strict=True)]
+            rows += [
+                (t, *origin, (v - model.settings.onboard_range_bias) / legs - bias)
+                for t, v in zip(model.seconds(o.time), o.value[:, 0], strict=True)
+            ]
     if len(rows) < 9:
         return None
     table = np.array(sorted(rows))
@@ -142,13 +148,20 @@ def _from_ranges(model: OrbitModel) -> tuple[np.ndarray, np.ndarray] | None:
             continue
         origins, distances = group[:, 1:4], group[:, 4]
         middle = origins.mean(axis=0)
-        starts = [guess] if guess is not None else [
-            middle + distances.mean() * _turned(middle / np.linalg.norm(middle), a, b)
-            for a in np.radians([-50, -20, 0, 20, 50]) for b in np.radians([-60, -20, 20, 60])]
+        starts = (
+            [guess]
+            if guess is not None
+            else [
+                middle + distances.mean() * _turned(middle / np.linalg.norm(middle), a, b)
+                for a in np.radians([-50, -20, 0, 20, 50])
+                for b in np.radians([-60, -20, 20, 60])
+            ]
+        )
         best = None
         for start in starts:
-            answer = least_squares(lambda x, o=origins, d=distances: np.linalg.norm(x - o, axis=1) - d, start,
-                                   x_scale=1e5)
+            answer = least_squares(
+                lambda x, o=origins, d=distances: np.linalg.norm(x - o, axis=1) - d, start, x_scale=1e5
+            )
             if best is None or answer.cost < best.cost:
                 best = answer
         assert best is not None
@@ -233,8 +246,11 @@ def _stationary(model: OrbitModel) -> tuple[np.ndarray, np.ndarray]:
         cost += np.where(local[:, 2] < 0, 1e6, 0.0)
         used += 1
     if used == 0:
-        raise TooFewDataError("range rates alone do not tell where to start", where="[orbit]",
-                              remedy="give an initial orbit: position_m and velocity_m_s, or a tle")
+        raise TooFewDataError(
+            "range rates alone do not tell where to start",
+            where="[orbit]",
+            remedy="give an initial orbit: position_m and velocity_m_s, or a tle",
+        )
     best = places[int(np.argmin(cost))]
     rotation = model.environment.earth_fixed_from_celestial(np.zeros(1))[0]
     return rotation.T @ best, rotation.T @ np.cross([0.0, 0.0, _SPIN], best)

@@ -31,8 +31,15 @@ class Correcting:
 
 
 _DATA: tuple[tuple[str, int | tuple[int, int]], ...] = (
-    ("intermediate", (3, 3)), ("angle", 1), ("pole", (3, 3)), ("transmitter", 3), ("transmitter_axes", (3, 3)),
-    ("transmitter_altitude", 1), ("receiver", 3), ("receiver_axes", (3, 3)), ("receiver_altitude", 1),
+    ("intermediate", (3, 3)),
+    ("angle", 1),
+    ("pole", (3, 3)),
+    ("transmitter", 3),
+    ("transmitter_axes", (3, 3)),
+    ("transmitter_altitude", 1),
+    ("receiver", 3),
+    ("receiver_axes", (3, 3)),
+    ("receiver_altitude", 1),
 )
 
 _KERNELS: dict[tuple, Kernel] = {}
@@ -58,18 +65,27 @@ def measurement_kernel(kind: Kind, signalling: Signalling, same: bool, correctin
             before = getattr(corrections, c.field)
             setattr(corrections, c.field, value if before is None else before + value)
         earth = Earth(seen["intermediate"], seen["angle"], seen["pole"])
-        sender, receptor = (Antenna(seen[n], seen[f"{n}_axes"], seen[f"{n}_altitude"]) for n in ("transmitter", "receiver"))
+        sender, receptor = (
+            Antenna(seen[n], seen[f"{n}_axes"], seen[f"{n}_altitude"]) for n in ("transmitter", "receiver")
+        )
         value = predicted(kind, seen["state"], earth, sender, receptor, signalling, corrections, same=same)
         return difference(kind, seen["measured"], value)
 
-    kernel = Kernel(f"orbit_{kind}", [c.unknown for c in correcting], [("state", STATE)],
-                    [("measured", SIZES[kind]), *_DATA], [], build)
+    kernel = Kernel(
+        f"orbit_{kind}",
+        [c.unknown for c in correcting],
+        [("state", STATE)],
+        [("measured", SIZES[kind]), *_DATA],
+        [],
+        build,
+    )
     _KERNELS[key] = kernel
     return kernel
 
 
-def measurement_data(environment: SpaceEnvironment, time: np.ndarray, transmitter: Station,
-                     receiver: Station) -> dict[str, np.ndarray]:
+def measurement_data(
+    environment: SpaceEnvironment, time: np.ndarray, transmitter: Station, receiver: Station
+) -> dict[str, np.ndarray]:
     """The kernel's data inputs (all but the measured value) at time tags (n,), s after the epoch."""
     intermediate, angle, pole = environment.orientation_parts(time)
     n = len(time)

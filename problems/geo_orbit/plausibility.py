@@ -42,21 +42,34 @@ def check_observations(model: OrbitModel) -> None:
             one_way = (o.value[:, 0] - s.onboard_range_bias) / legs
             low, high = int(np.argmin(one_way)), int(np.argmax(one_way))
             if one_way[low] < LOWEST_RANGE:
-                raise UnitError("a range is shorter than any orbit's height", where=at(low),
-                                value=f"{o.value[low, 0]:.6g} m", limit=f"at least {LOWEST_RANGE * legs:.3g} m",
-                                remedy="check the unit of the file (metres, kilometres, seconds, range units) and "
-                                       "whether ranges are half or the sum of both legs")
+                raise UnitError(
+                    "a range is shorter than any orbit's height",
+                    where=at(low),
+                    value=f"{o.value[low, 0]:.6g} m",
+                    limit=f"at least {LOWEST_RANGE * legs:.3g} m",
+                    remedy="check the unit of the file (metres, kilometres, seconds, range units) and "
+                    "whether ranges are half or the sum of both legs",
+                )
             if one_way[high] > HIGHEST_RANGE:
-                raise UnitError("a range is beyond the Moon", where=at(high), value=f"{o.value[high, 0]:.6g} m",
-                                limit=f"{HIGHEST_RANGE:.3g} m", remedy="check the unit of the file")
+                raise UnitError(
+                    "a range is beyond the Moon",
+                    where=at(high),
+                    value=f"{o.value[high, 0]:.6g} m",
+                    limit=f"{HIGHEST_RANGE:.3g} m",
+                    remedy="check the unit of the file",
+                )
         if o.kind == "azimuth_elevation":
             off = np.abs(o.value[:, 1]) > np.pi / 2 + 1e-9
             wide = np.abs(o.value[:, 0]) > 2 * np.pi + 1e-9
             if (off | wide).any():
                 row = int(np.flatnonzero(off | wide)[0])
-                raise UnitError("an angle is out of its range", where=at(row),
-                                value=f"azimuth {np.degrees(o.value[row, 0]):.6g}, elevation "
-                                      f"{np.degrees(o.value[row, 1]):.6g} degrees", limit="360 and 90 degrees")
+                raise UnitError(
+                    "an angle is out of its range",
+                    where=at(row),
+                    value=f"azimuth {np.degrees(o.value[row, 0]):.6g}, elevation "
+                    f"{np.degrees(o.value[row, 1]):.6g} degrees",
+                    limit="360 and 90 degrees",
+                )
         if o.kind == "direction_cosines" and (np.sum(o.value**2, axis=1) > 1.02).any():
             raise UnitError("direction cosines exceed unit length", where=place)
     _check_ranges_together(model)
@@ -72,20 +85,30 @@ def _check_ranges_together(model: OrbitModel) -> None:
         for b in ranges[i + 1 :]:
             ta, tb = model.seconds(a.time), model.seconds(b.time)
             index = np.clip(np.searchsorted(tb, ta), 1, max(len(tb) - 1, 1)) - 1
-            near = np.where(np.abs(tb[index] - ta) <= np.abs(tb[np.minimum(index + 1, len(tb) - 1)] - ta), index,
-                            np.minimum(index + 1, len(tb) - 1))
+            near = np.where(
+                np.abs(tb[index] - ta) <= np.abs(tb[np.minimum(index + 1, len(tb) - 1)] - ta),
+                index,
+                np.minimum(index + 1, len(tb) - 1),
+            )
             gap = np.abs(tb[near] - ta)
             change = np.abs(a.value[:, 0] - b.value[near, 0]) / legs
             p, q = model.station(a.receiver), model.station(b.receiver)
-            apart = float(np.linalg.norm(station_position(p.latitude, p.longitude, p.altitude)
-                                         - station_position(q.latitude, q.longitude, q.altitude)))
+            apart = float(
+                np.linalg.norm(
+                    station_position(p.latitude, p.longitude, p.altitude)
+                    - station_position(q.latitude, q.longitude, q.altitude)
+                )
+            )
             broken = (gap < 5.0) & (change > apart + allowance)
             if broken.mean() > 0.5 and broken.sum() >= 3:
                 row = int(np.flatnonzero(broken)[0])
                 raise GeometryError(
-                    f"ranges of {a.receiver} and {b.receiver} at the same time differ by more than the stations are apart",
-                    where=a.source, value=f"{change[row] / 1e3:.1f} km", limit=f"{apart / 1e3:.1f} km",
-                    remedy="check the coordinates of both stations and the legs of the ranges")
+                    f"ranges of {a.receiver} and {b.receiver} at one time differ by more than the stations are apart",
+                    where=a.source,
+                    value=f"{change[row] / 1e3:.1f} km",
+                    limit=f"{apart / 1e3:.1f} km",
+                    remedy="check the coordinates of both stations and the legs of the ranges",
+                )
 
 
 def predicted_elevations(model: OrbitModel) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -138,8 +161,10 @@ def _stumpff(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     safe = np.where(small, 1.0, z)
     with np.errstate(over="ignore"):
         positive = (1 - np.cos(root)) / safe, (root - np.sin(root)) / np.where(small, 1.0, root**3)
-        negative = (1 - np.cosh(np.minimum(root, 300))) / safe, (
-            np.sinh(np.minimum(root, 300)) - root) / np.where(small, 1.0, root**3)
+        negative = (
+            (1 - np.cosh(np.minimum(root, 300))) / safe,
+            (np.sinh(np.minimum(root, 300)) - root) / np.where(small, 1.0, root**3),
+        )
     c2 = np.where(small, 1 / 2 - z / 24 + z * z / 720, np.where(z > 0, positive[0], negative[0]))
     c3 = np.where(small, 1 / 6 - z / 120 + z * z / 5040, np.where(z > 0, positive[1], negative[1]))
     return c2, c3
@@ -159,15 +184,19 @@ def check_start(model: OrbitModel) -> None:
                 place = model.station(station.split(">")[-1])
                 raise GeometryError(
                     f"the satellite of the initial orbit is below the horizon of {station} at most of its measurements",
-                    where=name, value=f"median elevation {np.degrees(np.median(elevation)):.1f} degrees",
+                    where=name,
+                    value=f"median elevation {np.degrees(np.median(elevation)):.1f} degrees",
                     limit="above -5 degrees",
                     remedy=f"check latitude {np.degrees(place.latitude):.4f} and longitude "
-                           f"{np.degrees(place.longitude):.4f} degrees of the station (east positive), the initial "
-                           "orbit and the scale of the times")
+                    f"{np.degrees(place.longitude):.4f} degrees of the station (east positive), the initial "
+                    "orbit and the scale of the times",
+                )
             raise GeometryError(
                 "the satellite of the initial orbit is below the horizon of every station at most of the measurements",
                 value=f"median elevation {np.degrees(np.median(elevation)):.1f} degrees at {station}",
-                limit="above -5 degrees", remedy="check the initial orbit, its epoch and the scale of the times")
+                limit="above -5 degrees",
+                remedy="check the initial orbit, its epoch and the scale of the times",
+            )
 
 
 def suspicious_stations(model: OrbitModel, estimate: Estimate) -> list[str]:
@@ -195,13 +224,15 @@ def suspicious_stations(model: OrbitModel, estimate: Estimate) -> list[str]:
         after = float(np.mean([np.mean(p.whitened**2) for p in again.parts]))
         if before > 100.0 and after < 0.01 * before and (best is None or after < best[0]):
             left = [r for r in problem.residuals if r.name.split("/")[0] == name]
-            gaps = [f"{np.sqrt(np.mean(r.linearize(again.values).residual ** 2)):.4g} {r.unit} in {r.channel}"
-                    for r in left]
+            gaps = [
+                f"{np.sqrt(np.mean(r.linearize(again.values).residual ** 2)):.4g} {r.unit} in {r.channel}" for r in left
+            ]
             best = (after, name, " and ".join(gaps))
     if best is not None:
         place = model.station(best[1].split(">")[-1])
         sentences.append(
             f"the other stations agree with one orbit, from which {best[1]} is off by {best[2]}: check its latitude "
             f"({np.degrees(place.latitude):.4f} degrees), longitude ({np.degrees(place.longitude):.4f} degrees, east "
-            "positive), clock and bias")
+            "positive), clock and bias"
+        )
     return sentences

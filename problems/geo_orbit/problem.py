@@ -1,7 +1,9 @@
 """The ONE joint nonlinear least-squares problem of a set of tracking data; see the package for the question.
 
-``orbit_model(tracking, settings)`` prepares what does not depend on effects; ``orbit_problem(model, effects)`` makes the
-problem: ``position`` and ``velocity`` at the epoch, force parameters, velocity steps, biases, and the effects asked for.
+``orbit_model(tracking, settings)`` prepares what does not depend on effects; ``orbit_problem(model, effects)`` makes
+the
+problem: ``position`` and ``velocity`` at the epoch, force parameters, velocity steps, biases, and the effects asked
+for.
 """
 
 from __future__ import annotations
@@ -39,10 +41,18 @@ from problems.geo_orbit.kernels import Correcting, measurement_data, measurement
 from problems.geo_orbit.settings import OrbitSettings
 from problems.geo_orbit.tracking import Observations, Station, Tracking
 
-_BIAS_FIELDS = {"range": "range_bias", "range_rate": "range_rate_bias", "azimuth_elevation": "angle_bias",
-                "direction_cosines": "angle_bias"}
-_BIAS_NAMES = {"range": "range-bias", "range_rate": "range-rate-bias", "azimuth_elevation": "angle-bias",
-               "direction_cosines": "angle-bias"}
+_BIAS_FIELDS = {
+    "range": "range_bias",
+    "range_rate": "range_rate_bias",
+    "azimuth_elevation": "angle_bias",
+    "direction_cosines": "angle_bias",
+}
+_BIAS_NAMES = {
+    "range": "range-bias",
+    "range_rate": "range-rate-bias",
+    "azimuth_elevation": "angle-bias",
+    "direction_cosines": "angle-bias",
+}
 _BIAS_SCALES = {"range": 1e4, "range_rate": 1.0, "azimuth_elevation": 0.01, "direction_cosines": 0.01}
 
 
@@ -105,8 +115,11 @@ class OrbitModel:
         """
         found = self.settings.stations.get(name)
         if found is None:
-            raise MissingDataError(f"the data name the station {name!r}, which the settings do not have",
-                                   where="[[stations]]", remedy="add its name, latitude_deg, longitude_deg, altitude_m")
+            raise MissingDataError(
+                f"the data name the station {name!r}, which the settings do not have",
+                where="[[stations]]",
+                remedy="add its name, latitude_deg, longitude_deg, altitude_m",
+            )
         return found
 
     def estimated_components(self, name: str) -> tuple[str, ...]:
@@ -123,9 +136,18 @@ class OrbitModel:
             kinds.setdefault(o.receiver, []).append(o.kind)
         biased = tuple((name, tuple(c for c in self.estimated_components(name))) for name in kinds)
         return OrbitLayout(
-            tuple((k, tuple(v)) for k, v in kinds.items()), self.span, s.gravity, s.degree, s.sun and s.moon,
-            0.0 if s.reflection is None else s.reflection[0], bool(s.reflection and s.reflection[1]),
-            bool(s.acceleration and s.acceleration[2]), len(s.burns), s.light_time, biased)
+            tuple((k, tuple(v)) for k, v in kinds.items()),
+            self.span,
+            s.gravity,
+            s.degree,
+            s.sun and s.moon,
+            0.0 if s.reflection is None else s.reflection[0],
+            bool(s.reflection and s.reflection[1]),
+            bool(s.acceleration and s.acceleration[2]),
+            len(s.burns),
+            s.light_time,
+            biased,
+        )
 
     def thinned(self, keep: dict[str, np.ndarray]) -> OrbitModel:
         """The model with only the observations of the masks by residual name ("station/kind")."""
@@ -137,8 +159,9 @@ class OrbitModel:
         return replace(self, tracking=replace(self.tracking, observations=tuple(observations)))
 
 
-def celestial_start(settings: OrbitSettings, epoch: np.datetime64,
-                    orientation: EarthOrientation | None) -> tuple[np.ndarray, np.ndarray] | None:
+def celestial_start(
+    settings: OrbitSettings, epoch: np.datetime64, orientation: EarthOrientation | None
+) -> tuple[np.ndarray, np.ndarray] | None:
     """The settings' initial state in GCRS, or None where they have none."""
     if settings.position is None or settings.velocity is None:
         return None
@@ -167,8 +190,12 @@ def orbit_model(tracking: Tracking, settings: OrbitSettings, *, loss: Loss | Non
 
     numbers = sum(o.value.size for o in tracking.observations)
     if numbers < 6:
-        raise TooFewDataError("too few measurements for an orbit, which has six unknowns", value=f"{numbers} numbers",
-                              limit="at least 6", remedy="add measurements of other times or stations")
+        raise TooFewDataError(
+            "too few measurements for an orbit, which has six unknowns",
+            value=f"{numbers} numbers",
+            limit="at least 6",
+            remedy="add measurements of other times or stations",
+        )
     first = min(o.time.min() for o in tracking.observations)
     epoch = tai_from_utc([settings.epoch])[0] if settings.epoch else first
     orientation = read_bulletin_b(settings.bulletins) if settings.bulletins else None
@@ -177,8 +204,12 @@ def orbit_model(tracking: Tracking, settings: OrbitSettings, *, loss: Loss | Non
     check_observations(bare)
     if start is None:
         start = initial_state(bare)
-    model = replace(bare, position=start[0], velocity=start[1],
-                    velocity_steps=tuple(sorted(bare.seconds_of_text(t) for t in settings.manoeuvre_times)))
+    model = replace(
+        bare,
+        position=start[0],
+        velocity=start[1],
+        velocity_steps=tuple(sorted(bare.seconds_of_text(t) for t in settings.manoeuvre_times)),
+    )
     if settings.position is not None:
         check_start(model)
     return model
@@ -214,8 +245,18 @@ def _accelerations(model: OrbitModel) -> tuple[list[Acceleration], dict[str, np.
         labels = ("x", "y", "z") if frame == "celestial" else ("radial", "along", "cross")
         if estimated:
             both = labels + tuple(f"{a} rate" for a in labels)
-            unknowns.append((Unknown(name, Vector(3 * terms, both[: 3 * terms]), "m/s2" if terms == 1 else "m/s2, m/s3",
-                                     (1e-4,) * 3 + (1e-8,) * (3 * terms - 3), frame=frame), name))
+            unknowns.append(
+                (
+                    Unknown(
+                        name,
+                        Vector(3 * terms, both[: 3 * terms]),
+                        "m/s2" if terms == 1 else "m/s2, m/s3",
+                        (1e-4,) * 3 + (1e-8,) * (3 * terms - 3),
+                        frame=frame,
+                    ),
+                    name,
+                )
+            )
     if s.burns:
         present.append(BURN)
     return present, values, unknowns
@@ -224,8 +265,13 @@ def _accelerations(model: OrbitModel) -> tuple[list[Acceleration], dict[str, np.
 def effect_unknown(effect: OrbitEffect) -> Unknown:
     """The unknown that holds an effect's parameters."""
     units = tuple(dict.fromkeys(p.unit for p in effect.parameters))
-    return Unknown(effect.name, Vector(len(effect.parameters), tuple(p.name for p in effect.parameters)),
-                   ", ".join(units), tuple(p.scale for p in effect.parameters), description=effect.reference)
+    return Unknown(
+        effect.name,
+        Vector(len(effect.parameters), tuple(p.name for p in effect.parameters)),
+        ", ".join(units),
+        tuple(p.scale for p in effect.parameters),
+        description=effect.reference,
+    )
 
 
 def effect_start(effect: OrbitEffect) -> np.ndarray:
@@ -275,26 +321,54 @@ def orbit_problem(model: OrbitModel, effects: Sequence[str] = (), *, candidates:
     parameters = np.concatenate([np.zeros(0), *(values.get(a.name, np.zeros(a.size)) for a in present)])
     steps = []
     for number, time in enumerate(model.velocity_steps):
-        unknown = need(Unknown(f"manoeuvre-{number + 1}", Vector(4, ("time", "radial", "along", "cross")),
-                               "s, m/s", (3600.0, 10.0, 10.0, 10.0)), np.array([time, 0.0, 0.0, 0.0]))
+        unknown = need(
+            Unknown(
+                f"manoeuvre-{number + 1}",
+                Vector(4, ("time", "radial", "along", "cross")),
+                "s, m/s",
+                (3600.0, 10.0, 10.0, 10.0),
+            ),
+            np.array([time, 0.0, 0.0, 0.0]),
+        )
         steps.append(VelocityStep(unknown))
     for e in everything:
         if e.channel == "manoeuvre":
             steps.append(VelocityStep(need(effect_unknown(e), effect_start(e))))
     edges = tuple(t for b in model.burns for t in (b.start, b.stop))
-    arc = OrbitArc("orbit", equations, motion_inputs(model.environment, model.burns), 0.0, model.span, position, velocity,
-                   tuple(force_unknowns), parameters, tuple(steps), edges)
+    arc = OrbitArc(
+        "orbit",
+        equations,
+        motion_inputs(model.environment, model.burns),
+        0.0,
+        model.span,
+        position,
+        velocity,
+        tuple(force_unknowns),
+        parameters,
+        tuple(steps),
+        edges,
+    )
     residuals: list[Residual] = []
     for o in model.tracking.observations:
         residuals.append(_residual(model, arc, o, everything, need))
     held = frozenset(e.name for e in dormant)
-    return Problem(tuple(unknowns.values()), tuple(residuals), start, held,
-                   rebuild=lambda names: orbit_problem(model, names, candidates=candidates),
-                   effects=tuple(e.name for e in active))
+    return Problem(
+        tuple(unknowns.values()),
+        tuple(residuals),
+        start,
+        held,
+        rebuild=lambda names: orbit_problem(model, names, candidates=candidates),
+        effects=tuple(e.name for e in active),
+    )
 
 
-def _residual(model: OrbitModel, arc: OrbitArc, o: Observations, effects: Sequence[OrbitEffect],
-              need: Callable[[Unknown, np.ndarray], Unknown]) -> KernelResidual:
+def _residual(
+    model: OrbitModel,
+    arc: OrbitArc,
+    o: Observations,
+    effects: Sequence[OrbitEffect],
+    need: Callable[[Unknown, np.ndarray], Unknown],
+) -> KernelResidual:
     s = model.settings
     receiver, transmitter = model.station(o.receiver), model.station(o.transmitter)
     same = o.receiver == o.transmitter
@@ -307,8 +381,9 @@ def _residual(model: OrbitModel, arc: OrbitArc, o: Observations, effects: Sequen
     if o.kind == "range":
         measured = measured - s.onboard_range_bias
     if any(c in model.estimated_components(o.receiver) for c in components):
-        unknown = Unknown(f"{_BIAS_NAMES[o.kind]}:{o.name}", Vector(len(components), components), UNITS[o.kind],
-                          _BIAS_SCALES[o.kind])
+        unknown = Unknown(
+            f"{_BIAS_NAMES[o.kind]}:{o.name}", Vector(len(components), components), UNITS[o.kind], _BIAS_SCALES[o.kind]
+        )
         correcting.append(Correcting(need(unknown, bias), _BIAS_FIELDS[o.kind]))
     else:
         measured = measured - bias
@@ -318,6 +393,16 @@ def _residual(model: OrbitModel, arc: OrbitArc, o: Observations, effects: Sequen
     kernel = measurement_kernel(o.kind, signalling, same, correcting)
     sigma = np.array([receiver.sigma.get(c, s.sigma[c]) for c in components])
     data = {"measured": measured, **measurement_data(model.environment, time, transmitter, receiver)}
-    return KernelResidual(f"{o.name}/{o.kind}", o.kind, UNITS[o.kind], kernel, (OrbitSignal("state", arc, time),), data,
-                          np.tile(sigma, (len(time), 1)), time, np.zeros(len(time), dtype=int), (o.name,),
-                          loss=model.loss)
+    return KernelResidual(
+        f"{o.name}/{o.kind}",
+        o.kind,
+        UNITS[o.kind],
+        kernel,
+        (OrbitSignal("state", arc, time),),
+        data,
+        np.tile(sigma, (len(time), 1)),
+        time,
+        np.zeros(len(time), dtype=int),
+        (o.name,),
+        loss=model.loss,
+    )

@@ -1,7 +1,7 @@
 """The settings of an orbit determination: one TOML file, checked whole, with units in the names of its keys.
 
-Example: ``examples/w3b.toml``. Every table is optional but ``[[stations]]``; what a tracking file says about itself (the
-stations of a ``.in`` file, the legs of a ``.gmd`` range) is taken where the TOML is silent.
+Example: ``examples/w3b.toml``. Every table is optional but ``[[stations]]``; what a tracking file says about itself
+(the stations of a ``.in`` file, the legs of a ``.gmd`` range) is taken where the TOML is silent.
 """
 
 from __future__ import annotations
@@ -20,28 +20,80 @@ from estimator.models.orbit_motion import Burn
 from problems.geo_orbit.tracking import Station
 
 _DEGREE = np.pi / 180  # [rad]
-DEFAULT_SIGMA = {"range": 10.0, "range_rate": 0.01, "azimuth": 0.02 * _DEGREE, "elevation": 0.02 * _DEGREE,
-                 "cosine_north": 5e-4, "cosine_east": 5e-4}
+DEFAULT_SIGMA = {
+    "range": 10.0,
+    "range_rate": 0.01,
+    "azimuth": 0.02 * _DEGREE,
+    "elevation": 0.02 * _DEGREE,
+    "cosine_north": 5e-4,
+    "cosine_east": 5e-4,
+}
 """Standard deviation by component where neither file nor settings give one, SI."""
 
 _KEYS: dict[str, tuple[str, ...]] = {
-    "": ("title", "satellite", "orbit", "forces", "earth_orientation", "measurements", "stations", "burns", "files",
-         "manoeuvres"),
+    "": (
+        "title",
+        "satellite",
+        "orbit",
+        "forces",
+        "earth_orientation",
+        "measurements",
+        "stations",
+        "burns",
+        "files",
+        "manoeuvres",
+    ),
     "satellite": ("mass_kg", "area_m2"),
     "orbit": ("epoch", "frame", "position_m", "velocity_m_s", "tle", "sigma_position_m", "sigma_velocity_m_s"),
-    "forces": ("gravity", "degree", "order", "sun", "moon", "solar_radiation_pressure", "drag", "constant_acceleration"),
+    "forces": (
+        "gravity",
+        "degree",
+        "order",
+        "sun",
+        "moon",
+        "solar_radiation_pressure",
+        "drag",
+        "constant_acceleration",
+    ),
     "forces.solar_radiation_pressure": ("coefficient", "estimated"),
     "forces.drag": ("coefficient", "estimated"),
     "forces.constant_acceleration": ("terms", "frame", "estimated"),
     "earth_orientation": ("bulletins",),
-    "measurements": ("range", "time_tag", "time_scale", "onboard_range_bias_m", "troposphere", "refraction",
-                     "light_time", "rejection_sigmas", "estimate_biases", "range_sigma_m", "range_rate_sigma_m_s",
-                     "azimuth_sigma_deg", "elevation_sigma_deg", "cosine_sigma"),
+    "measurements": (
+        "range",
+        "time_tag",
+        "time_scale",
+        "start",
+        "stop",
+        "onboard_range_bias_m",
+        "troposphere",
+        "refraction",
+        "light_time",
+        "rejection_sigmas",
+        "estimate_biases",
+        "range_sigma_m",
+        "range_rate_sigma_m_s",
+        "azimuth_sigma_deg",
+        "elevation_sigma_deg",
+        "cosine_sigma",
+    ),
     "manoeuvres": ("detect", "times", "sigma_m_s"),
     "files": ("measurements",),
-    "stations": ("name", "latitude_deg", "longitude_deg", "altitude_m", "range_sigma_m", "range_rate_sigma_m_s",
-                 "azimuth_sigma_deg", "elevation_sigma_deg", "range_bias_m", "range_rate_bias_m_s", "azimuth_bias_deg",
-                 "elevation_bias_deg", "estimate_biases"),
+    "stations": (
+        "name",
+        "latitude_deg",
+        "longitude_deg",
+        "altitude_m",
+        "range_sigma_m",
+        "range_rate_sigma_m_s",
+        "azimuth_sigma_deg",
+        "elevation_sigma_deg",
+        "range_bias_m",
+        "range_rate_bias_m_s",
+        "azimuth_bias_deg",
+        "elevation_bias_deg",
+        "estimate_biases",
+    ),
     "burns": ("start", "stop", "acceleration_m_s2"),
 }
 
@@ -142,8 +194,11 @@ def _checked_keys(table: Mapping[str, Any], place: str) -> None:
     for key in table:
         if key not in known:
             near = difflib.get_close_matches(key, known, 1)
-            raise RequestError(f"no setting is named {key!r}", where=f"[{place}]" if place else "settings",
-                               remedy=(f"did you mean {near[0]!r}?" if near else "choose from " + ", ".join(known)))
+            raise RequestError(
+                f"no setting is named {key!r}",
+                where=f"[{place}]" if place else "settings",
+                remedy=(f"did you mean {near[0]!r}?" if near else "choose from " + ", ".join(known)),
+            )
 
 
 def _table(tables: Mapping[str, Any], name: str) -> Mapping[str, Any]:
@@ -156,13 +211,16 @@ def _table(tables: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     return value
 
 
-def _number(table: Mapping[str, Any], key: str, default: float, where: str, low: float = -np.inf,
-            high: float = np.inf) -> float:
+def _number(
+    table: Mapping[str, Any], key: str, default: float, where: str, low: float = -np.inf, high: float = np.inf
+) -> float:
     value = table.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
         raise RequestError("this must be a number", where=f"{where} {key}", value=value)
     if not low <= value <= high:
-        raise RequestError("this is out of its range", where=f"{where} {key}", value=value, limit=f"{low:g} to {high:g}")
+        raise RequestError(
+            "this is out of its range", where=f"{where} {key}", value=value, limit=f"{low:g} to {high:g}"
+        )
     return float(value)
 
 
@@ -170,8 +228,11 @@ def _vector(table: Mapping[str, Any], key: str, where: str) -> tuple[float, floa
     value = table.get(key)
     if value is None:
         return None
-    if not isinstance(value, list | tuple) or len(value) != 3 or not all(
-            isinstance(v, int | float) and np.isfinite(v) for v in value):
+    if (
+        not isinstance(value, list | tuple)
+        or len(value) != 3
+        or not all(isinstance(v, int | float) and np.isfinite(v) for v in value)
+    ):
         raise RequestError("this must be three numbers", where=f"{where} {key}", value=value)
     return float(value[0]), float(value[1]), float(value[2])
 
@@ -179,8 +240,9 @@ def _vector(table: Mapping[str, Any], key: str, where: str) -> tuple[float, floa
 def _choice(table: Mapping[str, Any], key: str, default: str, choices: tuple[str, ...], where: str) -> str:
     value = table.get(key, default)
     if value not in choices:
-        raise RequestError("this is none of the choices", where=f"{where} {key}", value=value,
-                           limit=" or ".join(choices))
+        raise RequestError(
+            "this is none of the choices", where=f"{where} {key}", value=value, limit=" or ".join(choices)
+        )
     return str(value)
 
 
@@ -194,18 +256,31 @@ def _station(entry: Mapping[str, Any]) -> Station:
         if key not in entry:
             raise MissingDataError(f"{key} is missing", where=where)
     sigma, bias = {}, {}
-    for component, key, unit in (("range", "range_sigma_m", 1.0), ("range_rate", "range_rate_sigma_m_s", 1.0),
-                                 ("azimuth", "azimuth_sigma_deg", _DEGREE), ("elevation", "elevation_sigma_deg", _DEGREE)):
+    for component, key, unit in (
+        ("range", "range_sigma_m", 1.0),
+        ("range_rate", "range_rate_sigma_m_s", 1.0),
+        ("azimuth", "azimuth_sigma_deg", _DEGREE),
+        ("elevation", "elevation_sigma_deg", _DEGREE),
+    ):
         if key in entry:
             sigma[component] = unit * _number(entry, key, 0.0, where, low=1e-12)
-    for component, key, unit in (("range", "range_bias_m", 1.0), ("range_rate", "range_rate_bias_m_s", 1.0),
-                                 ("azimuth", "azimuth_bias_deg", _DEGREE), ("elevation", "elevation_bias_deg", _DEGREE)):
+    for component, key, unit in (
+        ("range", "range_bias_m", 1.0),
+        ("range_rate", "range_rate_bias_m_s", 1.0),
+        ("azimuth", "azimuth_bias_deg", _DEGREE),
+        ("elevation", "elevation_bias_deg", _DEGREE),
+    ):
         if key in entry:
             bias[component] = unit * _number(entry, key, 0.0, where)
-    return Station(name, _number(entry, "latitude_deg", 0.0, where, -90, 90) * _DEGREE,
-                   _number(entry, "longitude_deg", 0.0, where, -360, 360) * _DEGREE,
-                   _number(entry, "altitude_m", 0.0, where, -500, 9000), sigma, bias,
-                   _components(entry.get("estimate_biases", ()), where))
+    return Station(
+        name,
+        _number(entry, "latitude_deg", 0.0, where, -90, 90) * _DEGREE,
+        _number(entry, "longitude_deg", 0.0, where, -360, 360) * _DEGREE,
+        _number(entry, "altitude_m", 0.0, where, -500, 9000),
+        sigma,
+        bias,
+        _components(entry.get("estimate_biases", ()), where),
+    )
 
 
 def _components(value: Any, where: str) -> tuple[str, ...]:
@@ -216,8 +291,12 @@ def _components(value: Any, where: str) -> tuple[str, ...]:
         elif v in DEFAULT_SIGMA:
             names.append(v)
         else:
-            raise RequestError("no measurement is named so", where=f"{where} estimate_biases", value=v,
-                               limit="range, range_rate, angles, cosine_north, cosine_east")
+            raise RequestError(
+                "no measurement is named so",
+                where=f"{where} estimate_biases",
+                value=v,
+                limit="range, range_rate, angles, cosine_north, cosine_east",
+            )
     return tuple(names)
 
 
@@ -247,13 +326,22 @@ def settings_from(tables: Mapping[str, Any], stations: Mapping[str, Station]) ->
     if position is not None:
         radius = float(np.linalg.norm(position))
         if radius < 6.4e6:
-            raise UnitError("the initial position is inside the Earth", where="[orbit] position_m",
-                            value=f"{radius:.6g} m", limit="at least 6.4e6 m", remedy="give metres, not kilometres")
+            raise UnitError(
+                "the initial position is inside the Earth",
+                where="[orbit] position_m",
+                value=f"{radius:.6g} m",
+                limit="at least 6.4e6 m",
+                remedy="give metres, not kilometres",
+            )
         if velocity is None:
             raise MissingDataError("an initial position needs an initial velocity", where="[orbit] velocity_m_s")
         if not 100 < float(np.linalg.norm(velocity)) < 12e3:
-            raise UnitError("the initial speed is no orbit's", where="[orbit] velocity_m_s",
-                            value=f"{np.linalg.norm(velocity):.6g} m/s", limit="100 to 12000 m/s")
+            raise UnitError(
+                "the initial speed is no orbit's",
+                where="[orbit] velocity_m_s",
+                value=f"{np.linalg.norm(velocity):.6g} m/s",
+                limit="100 to 12000 m/s",
+            )
         if "epoch" not in orbit:
             raise MissingDataError("an initial state needs its epoch", where="[orbit] epoch")
     pressure = _table(tables, "forces.solar_radiation_pressure") if "solar_radiation_pressure" in forces else None
@@ -261,10 +349,14 @@ def settings_from(tables: Mapping[str, Any], stations: Mapping[str, Station]) ->
     constant = _table(tables, "forces.constant_acceleration") if "constant_acceleration" in forces else None
     degree = int(_number(forces, "degree", 20, "[forces]", 0, 360))
     sigma = dict(DEFAULT_SIGMA)
-    for component, key, unit in (("range", "range_sigma_m", 1.0), ("range_rate", "range_rate_sigma_m_s", 1.0),
-                                 ("azimuth", "azimuth_sigma_deg", _DEGREE),
-                                 ("elevation", "elevation_sigma_deg", _DEGREE), ("cosine_north", "cosine_sigma", 1.0),
-                                 ("cosine_east", "cosine_sigma", 1.0)):
+    for component, key, unit in (
+        ("range", "range_sigma_m", 1.0),
+        ("range_rate", "range_rate_sigma_m_s", 1.0),
+        ("azimuth", "azimuth_sigma_deg", _DEGREE),
+        ("elevation", "elevation_sigma_deg", _DEGREE),
+        ("cosine_north", "cosine_sigma", 1.0),
+        ("cosine_east", "cosine_sigma", 1.0),
+    ):
         if key in measurements:
             sigma[component] = unit * _number(measurements, key, 0.0, "[measurements]", low=1e-12)
     burns = []
@@ -288,29 +380,44 @@ def settings_from(tables: Mapping[str, Any], stations: Mapping[str, Station]) ->
         area=_number(satellite, "area_m2", 10.0, "[satellite]", 0.0, 1e5),
         epoch=str(orbit["epoch"]) if "epoch" in orbit else None,
         frame=_choice(orbit, "frame", "EME2000", ("EME2000", "GCRF", "ITRF"), "[orbit]"),
-        position=position, velocity=velocity, tle=lines,
-        gravity=str(forces.get("gravity", "EGM2008_120")), degree=degree,
+        position=position,
+        velocity=velocity,
+        tle=lines,
+        gravity=str(forces.get("gravity", "EGM2008_120")),
+        degree=degree,
         order=int(_number(forces, "order", degree, "[forces]", 0, degree)),
-        sun=bool(forces.get("sun", True)), moon=bool(forces.get("moon", True)),
-        reflection=None if pressure is None else (
+        sun=bool(forces.get("sun", True)),
+        moon=bool(forces.get("moon", True)),
+        reflection=None
+        if pressure is None
+        else (
             _number(pressure, "coefficient", 1.5, "[forces.solar_radiation_pressure]"),
-            bool(pressure.get("estimated", False))),
-        drag=None if air is None else (_number(air, "coefficient", 2.0, "[forces.drag]"),
-                                       bool(air.get("estimated", False))),
-        acceleration=None if constant is None else (
+            bool(pressure.get("estimated", False)),
+        ),
+        drag=None
+        if air is None
+        else (_number(air, "coefficient", 2.0, "[forces.drag]"), bool(air.get("estimated", False))),
+        acceleration=None
+        if constant is None
+        else (
             int(_number(constant, "terms", 1, "[forces.constant_acceleration]", 1, 2)),
             _choice(constant, "frame", "celestial", ("celestial", "orbital"), "[forces.constant_acceleration]"),
-            bool(constant.get("estimated", True))),
+            bool(constant.get("estimated", True)),
+        ),
         bulletins=tuple(str(b) for b in _table(tables, "earth_orientation").get("bulletins", ())),
         legs=_choice(measurements, "range", "half", ("half", "sum"), "[measurements]"),
-        time_tag=_choice(measurements, "time_tag", "reception", ("reception", "bounce", "transmission"),
-                         "[measurements]"),
-        troposphere=bool(measurements.get("troposphere", True)), refraction=bool(measurements.get("refraction", True)),
+        time_tag=_choice(
+            measurements, "time_tag", "reception", ("reception", "bounce", "transmission"), "[measurements]"
+        ),
+        troposphere=bool(measurements.get("troposphere", True)),
+        refraction=bool(measurements.get("refraction", True)),
         light_time=bool(measurements.get("light_time", True)),
         onboard_range_bias=_number(measurements, "onboard_range_bias_m", 0.0, "[measurements]"),
         rejection=_number(measurements, "rejection_sigmas", 6.0, "[measurements]", low=2.0),
         estimate_biases=_components(measurements.get("estimate_biases", ()), "[measurements]"),
-        sigma=sigma, stations=known, burns=tuple(burns),
+        sigma=sigma,
+        stations=known,
+        burns=tuple(burns),
         manoeuvre_times=tuple(str(t) for t in manoeuvres.get("times", ())),
         detect_manoeuvres=manoeuvres.get("detect"),
     )

@@ -1,4 +1,5 @@
-"""From tracking data to the answer: check, start, solve jointly, leave gross outliers out, say it in the user's terms."""
+"""From tracking data to the answer: check, start, solve jointly, leave gross outliers out, say it in the user's
+terms."""
 
 from __future__ import annotations
 
@@ -86,9 +87,13 @@ class OrbitSolution:
         answer = {}
         for name, pieces in sorted(groups.items()):
             v = np.concatenate(pieces)
-            answer[name] = {"count": len(v), "rms": float(np.sqrt(np.mean(v**2))) if len(v) else None,
-                            "unit": units[name], "mean": float(v.mean()) if len(v) else None,
-                            "standard_deviation": float(v.std()) if len(v) else None}
+            answer[name] = {
+                "count": len(v),
+                "rms": float(np.sqrt(np.mean(v**2))) if len(v) else None,
+                "unit": units[name],
+                "mean": float(v.mean()) if len(v) else None,
+                "standard_deviation": float(v.std()) if len(v) else None,
+            }
         return answer
 
     def parameters(self) -> dict[str, dict[str, Any]]:
@@ -109,34 +114,63 @@ class OrbitSolution:
         found = []
         for e in chosen(self.model.layout, self.estimate.problem.effects):
             values, sigma = self.estimate.values[e.name], self.estimate.sigma_of(e.name)
-            found.append({"name": e.name, "parameters": {
-                p.name: {"value": float(v), "sigma": float(s), "unit": p.unit}
-                for p, v, s in zip(e.parameters, values, sigma, strict=True)}})
+            found.append(
+                {
+                    "name": e.name,
+                    "parameters": {
+                        p.name: {"value": float(v), "sigma": float(s), "unit": p.unit}
+                        for p, v, s in zip(e.parameters, values, sigma, strict=True)
+                    },
+                }
+            )
         return found
 
     def as_dict(self) -> dict[str, Any]:
         """The machine-readable answer."""
         return {
-            "status": str(self.status), "why": self.why, "epoch": utc_text(self.model.epoch), "time_scale": "UTC",
-            "frame": self.frame, "position_m": self.position, "velocity_m_s": self.velocity,
-            "covariance": self.covariance, "parameters": self.parameters(), "residuals": self.residuals(),
-            "effects": self.effects(), "chi2_per_dof": self.estimate.chi_square_per_degree(),
-            "unobservable": [w.sentence for w in self.estimate.weak], "rejected": self.rejected,
-            "iterations": self.estimate.iterations, "seconds": self.seconds,
+            "status": str(self.status),
+            "why": self.why,
+            "epoch": utc_text(self.model.epoch),
+            "time_scale": "UTC",
+            "frame": self.frame,
+            "position_m": self.position,
+            "velocity_m_s": self.velocity,
+            "covariance": self.covariance,
+            "parameters": self.parameters(),
+            "residuals": self.residuals(),
+            "effects": self.effects(),
+            "chi2_per_dof": self.estimate.chi_square_per_degree(),
+            "unobservable": [w.sentence for w in self.estimate.weak],
+            "rejected": self.rejected,
+            "iterations": self.estimate.iterations,
+            "seconds": self.seconds,
         }
 
     def __str__(self) -> str:
-        lines = [self.model.settings.title or self.model.tracking.satellite or "orbit", "", f"{self.status}: {self.why}",
-                 "", f"epoch {utc_text(self.model.epoch)}, {self.frame}"]
+        lines = [
+            self.model.settings.title or self.model.tracking.satellite or "orbit",
+            "",
+            f"{self.status}: {self.why}",
+            "",
+            f"epoch {utc_text(self.model.epoch)}, {self.frame}",
+        ]
         sigma = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
-        for label, v, s, unit in zip(("x", "y", "z", "vx", "vy", "vz"), [*self.position, *self.velocity], sigma,
-                                     ["m"] * 3 + ["m/s"] * 3, strict=True):
+        for label, v, s, unit in zip(
+            ("x", "y", "z", "vx", "vy", "vz"),
+            [*self.position, *self.velocity],
+            sigma,
+            ["m"] * 3 + ["m/s"] * 3,
+            strict=True,
+        ):
             lines.append(f"  {label:<4}{v:>20.4f}{s:>14.4g}  {unit}")
         lines += ["", f"{'parameter':<44}{'value':>16}{'sigma':>12}  unit"]
         lines += [f"{n:<44}{p['value']:>16.8g}{p['sigma']:>12.3g}  {p['unit']}" for n, p in self.parameters().items()]
         lines += ["", f"{'residual':<44}{'count':>8}{'rms':>14}  unit"]
-        lines += [f"{n:<44}{r['count']:>8}{r['rms']:>14.6g}  {r['unit']}" for n, r in self.residuals().items()
-                  if r["rms"] is not None]
+        lines += [
+            f"{n:<44}{r['count']:>8}{r['rms']:>14.6g}  {r['unit']}"
+            for n, r in self.residuals().items()
+            if r["rms"] is not None
+        ]
         return "\n".join([*lines, "", f"{self.seconds:.2f} s"])
 
 
@@ -197,8 +231,14 @@ def without_outliers(problem: Problem, estimate: Estimate, sigmas: float) -> tup
     return problem.with_residuals(residuals), rejected
 
 
-def solve_tracking(tracking: Tracking, settings: OrbitSettings, *, effects: Sequence[str] = (),
-                   loss: Loss | None = None, options: Options | None = None) -> OrbitSolution:
+def solve_tracking(
+    tracking: Tracking,
+    settings: OrbitSettings,
+    *,
+    effects: Sequence[str] = (),
+    loss: Loss | None = None,
+    options: Options | None = None,
+) -> OrbitSolution:
     """Solve the joint problem of tracking data.
 
     Args:
@@ -240,10 +280,12 @@ def concluded(model: OrbitModel, estimate: Estimate, rejected: dict[str, int], s
         why += suspicious_stations(model, estimate)
     if rejected:
         total = sum(rejected.values())
-        why.append(f"{total} measurements lie far from all others and were left out ("
-                   + ", ".join(f"{n}: {c}" for n, c in rejected.items()) + ")")
+        why.append(
+            f"{total} measurements lie far from all others and were left out ("
+            + ", ".join(f"{n}: {c}" for n, c in rejected.items())
+            + ")"
+        )
         measured = sum(r.samples for r in estimate.problem.residuals if isinstance(r, KernelResidual))
         if total > 0.2 * measured:
             status = max(status, Status.MODEL_GAP, key=lambda s: s.gravity)
     return OrbitSolution(model, estimate, rejected, status, ". ".join(w for w in why if w), seconds)
-

@@ -59,8 +59,9 @@ class Observations:
 
     def subset(self, keep: np.ndarray) -> Observations:
         """The observations of the boolean mask ``keep`` (n,)."""
-        return replace(self, time=self.time[keep], value=self.value[keep],
-                       line=None if self.line is None else self.line[keep])
+        return replace(
+            self, time=self.time[keep], value=self.value[keep], line=None if self.line is None else self.line[keep]
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +85,12 @@ class Tracking:
         groups: dict[tuple[str, str, str], list[Observations]] = {}
         for o in (*self.observations, *other.observations):
             groups.setdefault((o.kind, o.transmitter, o.receiver), []).append(o)
-        return Tracking(tuple(_joined(g) for g in groups.values()), {**self.stations, **other.stations},
-                        deep_merged(self.settings, other.settings), self.satellite or other.satellite)
+        return Tracking(
+            tuple(_joined(g) for g in groups.values()),
+            {**self.stations, **other.stations},
+            deep_merged(self.settings, other.settings),
+            self.satellite or other.satellite,
+        )
 
 
 def _joined(group: list[Observations]) -> Observations:
@@ -94,14 +99,22 @@ def _joined(group: list[Observations]) -> Observations:
     time = np.concatenate([g.time for g in group])
     order = np.argsort(time, kind="stable")
     lines = [np.zeros(len(g.time), dtype=int) if g.line is None else g.line for g in group]
-    return Observations(group[0].kind, group[0].receiver, group[0].transmitter, time[order],
-                        np.concatenate([g.value for g in group])[order], ", ".join(dict.fromkeys(g.source for g in group)),
-                        np.concatenate(lines)[order])
+    return Observations(
+        group[0].kind,
+        group[0].receiver,
+        group[0].transmitter,
+        time[order],
+        np.concatenate([g.value for g in group])[order],
+        ", ".join(dict.fromkeys(g.source for g in group)),
+        np.concatenate(lines)[order],
+    )
 
 
 def deep_merged(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
     """Nested tables with those of ``b`` over those of ``a``."""
     merged = dict(a)
     for key, value in b.items():
-        merged[key] = deep_merged(merged[key], value) if isinstance(value, dict) and isinstance(merged.get(key), dict) else value
+        merged[key] = (
+            deep_merged(merged[key], value) if isinstance(value, dict) and isinstance(merged.get(key), dict) else value
+        )
     return merged

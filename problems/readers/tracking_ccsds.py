@@ -1,4 +1,5 @@
-"""CCSDS Tracking Data Messages (503.0-B) and Orbit Ephemeris Messages (502.0-B) in key = value notation, read and written.
+"""CCSDS Tracking Data Messages (503.0-B) and Orbit Ephemeris Messages (502.0-B) in key = value notation, read and
+written.
 
 TDM: RANGE (km, s, or RU where the transponder's conversion is not needed is refused), DOPPLER_INSTANTANEOUS and
 DOPPLER_INTEGRATED (km/s), ANGLE_1 and ANGLE_2 (AZEL, degrees). A range of a path ``1,2,1`` is taken as the file's
@@ -45,8 +46,13 @@ def tai_from_text(texts: list[str], scale: str, where: str) -> np.ndarray:
         except FileFormatError as error:
             raise FileFormatError(error.what, where=where, value=error.value, limit=error.limit) from error
     if scale not in _TAI_MINUS:
-        raise RequestError("the scale of the times is not known", where=where, value=scale or "none",
-                           limit="UTC, TAI, GPS or TT", remedy="state TIME_SYSTEM in the file")
+        raise RequestError(
+            "the scale of the times is not known",
+            where=where,
+            value=scale or "none",
+            limit="UTC, TAI, GPS or TT",
+            remedy="state TIME_SYSTEM in the file",
+        )
     try:
         times = np.array([np.datetime64(t, "us") for t in plain])
     except ValueError as error:
@@ -121,12 +127,17 @@ def read_tdm(path: Path) -> Tracking:
             satellite, receiver = ends
             transmitter = receiver
             if any(line.split("=")[0].strip() in _KINDS for _, line in block.rows):
-                raise RequestError("one-way ranges and Doppler are not supported", where=str(path), value=path_text,
-                                   limit="PATH such as 1,2,1")
+                raise RequestError(
+                    "one-way ranges and Doppler are not supported",
+                    where=str(path),
+                    value=path_text,
+                    limit="PATH such as 1,2,1",
+                )
         else:
             raise FileFormatError("this signal path is not known", where=str(path), value=path_text, limit="1,2,1")
-        tags.add({"TRANSMIT": "transmission", "RECEIVE": "reception"}.get(meta.get("TIMETAG_REF", "RECEIVE"),
-                                                                           "reception"))
+        tags.add(
+            {"TRANSMIT": "transmission", "RECEIVE": "reception"}.get(meta.get("TIMETAG_REF", "RECEIVE"), "reception")
+        )
         angles = meta.get("ANGLE_TYPE", "AZEL")
         unit = meta.get("RANGE_UNITS", "km")
         found: dict[str, list[tuple[str, float, int]]] = {}
@@ -139,8 +150,9 @@ def read_tdm(path: Path) -> Tracking:
             try:
                 found.setdefault(key, []).append((words[0], float(words[1]), number))
             except (IndexError, ValueError) as error:
-                raise FileFormatError("this data line is not 'KEY = time value'", where=f"{path}:{number}",
-                                      value=line[:60]) from error
+                raise FileFormatError(
+                    "this data line is not 'KEY = time value'", where=f"{path}:{number}", value=line[:60]
+                ) from error
         for key, kind in _KINDS.items():
             rows = found.get(key)
             if not rows:
@@ -148,21 +160,35 @@ def read_tdm(path: Path) -> Tracking:
             if kind == "range":
                 factors = {"km": 1e3, "s": _LIGHT}
                 if unit not in factors:
-                    raise RequestError("this unit of range is not known", where=f"{path}: RANGE_UNITS", value=unit,
-                                       limit="km or s", remedy="convert range units with the transponder's constants")
+                    raise RequestError(
+                        "this unit of range is not known",
+                        where=f"{path}: RANGE_UNITS",
+                        value=unit,
+                        limit="km or s",
+                        remedy="convert range units with the transponder's constants",
+                    )
                 factor = factors[unit]
                 legs.add("sum")
             else:
                 factor = 1e3
             time = tai_from_text([r[0] for r in rows], scale, str(path))
             order = np.argsort(time, kind="stable")
-            observations.append(Observations(kind, receiver, transmitter, time[order],  # type: ignore[arg-type]
-                                             factor * np.array([[r[1]] for r in rows])[order], path.name,
-                                             np.array([r[2] for r in rows])[order]))
+            observations.append(
+                Observations(
+                    kind,
+                    receiver,
+                    transmitter,
+                    time[order],  # type: ignore[arg-type]
+                    factor * np.array([[r[1]] for r in rows])[order],
+                    path.name,
+                    np.array([r[2] for r in rows])[order],
+                )
+            )
         if "ANGLE_1" in found:
             if angles != "AZEL":
-                raise RequestError("this kind of angles is not known", where=f"{path}: ANGLE_TYPE", value=angles,
-                                   limit="AZEL")
+                raise RequestError(
+                    "this kind of angles is not known", where=f"{path}: ANGLE_TYPE", value=angles, limit="AZEL"
+                )
             first, second = found["ANGLE_1"], {r[0]: r[1] for r in found.get("ANGLE_2", [])}
             paired = [r for r in first if r[0] in second]
             if not paired:
@@ -170,8 +196,17 @@ def read_tdm(path: Path) -> Tracking:
             time = tai_from_text([r[0] for r in paired], scale, str(path))
             order = np.argsort(time, kind="stable")
             value = _DEGREE * np.array([[r[1], second[r[0]]] for r in paired])
-            observations.append(Observations("azimuth_elevation", receiver, receiver, time[order], value[order],
-                                             path.name, np.array([r[2] for r in paired])[order]))
+            observations.append(
+                Observations(
+                    "azimuth_elevation",
+                    receiver,
+                    receiver,
+                    time[order],
+                    value[order],
+                    path.name,
+                    np.array([r[2] for r in paired])[order],
+                )
+            )
     if not observations:
         raise FileFormatError("the message holds no RANGE, DOPPLER or ANGLE lines", where=str(path))
     if len(tags) > 1:
@@ -210,8 +245,11 @@ def write_tdm(path: Path, tracking: Tracking, *, time_tag: str = "reception", or
         if o.receiver != o.transmitter:
             lines.append(f"PARTICIPANT_3 = {o.receiver}")
             hops = "1,2,3"
-        lines += ["MODE = SEQUENTIAL", f"PATH = {hops}",
-                  f"TIMETAG_REF = {'RECEIVE' if time_tag == 'reception' else 'TRANSMIT'}"]
+        lines += [
+            "MODE = SEQUENTIAL",
+            f"PATH = {hops}",
+            f"TIMETAG_REF = {'RECEIVE' if time_tag == 'reception' else 'TRANSMIT'}",
+        ]
         if o.kind == "azimuth_elevation":
             lines.append("ANGLE_TYPE = AZEL")
         if o.kind == "range":
@@ -268,12 +306,17 @@ def read_oem(path: Path) -> Ephemeris:
             if key not in meta:
                 raise FileFormatError(f"{key} is missing", where=str(path))
         if meta["CENTER_NAME"].upper() != "EARTH":
-            raise RequestError("only orbits about the Earth are known", where=f"{path}: CENTER_NAME",
-                               value=meta["CENTER_NAME"])
+            raise RequestError(
+                "only orbits about the Earth are known", where=f"{path}: CENTER_NAME", value=meta["CENTER_NAME"]
+            )
         frame = "ITRF" if meta["REF_FRAME"].startswith("ITRF") else _FRAMES.get(meta["REF_FRAME"], "")
         if not frame:
-            raise RequestError("this frame is not known", where=f"{path}: REF_FRAME", value=meta["REF_FRAME"],
-                               limit=", ".join([*_FRAMES, "ITRF*"]))
+            raise RequestError(
+                "this frame is not known",
+                where=f"{path}: REF_FRAME",
+                value=meta["REF_FRAME"],
+                limit=", ".join([*_FRAMES, "ITRF*"]),
+            )
         texts, rows = [], []
         for number, line in block.rows:
             words = line.split()
@@ -282,8 +325,9 @@ def read_oem(path: Path) -> Ephemeris:
                 if len(values) != 6 or not np.isfinite(values).all():
                     raise ValueError(line)
             except ValueError as error:
-                raise FileFormatError("this line is no state: time and six finite numbers", where=f"{path}:{number}",
-                                      value=line[:60]) from error
+                raise FileFormatError(
+                    "this line is no state: time and six finite numbers", where=f"{path}:{number}", value=line[:60]
+                ) from error
             texts.append(words[0])
             rows.append(values)
         if rows:
@@ -313,11 +357,27 @@ def write_oem(path: Path, ephemeris: Ephemeris, *, originator: str = "BORESIGHT"
         raise RequestError("this frame is not known", where="ephemeris/frame", value=ephemeris.frame)
     texts = [utc_text(t).rstrip("Z") for t in ephemeris.time]
     frame = "ITRF2014" if ephemeris.frame == "ITRF" else ephemeris.frame
-    lines = ["CCSDS_OEM_VERS = 2.0", f"CREATION_DATE = {texts[-1]}", f"ORIGINATOR = {originator}", "", "META_START",
-             f"OBJECT_NAME = {ephemeris.name}", f"OBJECT_ID = {ephemeris.identifier}", "CENTER_NAME = EARTH",
-             f"REF_FRAME = {frame}", "TIME_SYSTEM = UTC", f"START_TIME = {texts[0]}", f"STOP_TIME = {texts[-1]}",
-             "INTERPOLATION = LAGRANGE", f"INTERPOLATION_DEGREE = {min(degree, len(texts) - 1)}", "META_STOP", ""]
+    lines = [
+        "CCSDS_OEM_VERS = 2.0",
+        f"CREATION_DATE = {texts[-1]}",
+        f"ORIGINATOR = {originator}",
+        "",
+        "META_START",
+        f"OBJECT_NAME = {ephemeris.name}",
+        f"OBJECT_ID = {ephemeris.identifier}",
+        "CENTER_NAME = EARTH",
+        f"REF_FRAME = {frame}",
+        "TIME_SYSTEM = UTC",
+        f"START_TIME = {texts[0]}",
+        f"STOP_TIME = {texts[-1]}",
+        "INTERPOLATION = LAGRANGE",
+        f"INTERPOLATION_DEGREE = {min(degree, len(texts) - 1)}",
+        "META_STOP",
+        "",
+    ]
     for text, row in zip(texts, ephemeris.state, strict=True):
-        lines.append(text + "".join(f" {v:.9f}" for v in row[:3] * 1e-3) + "".join(f" {v:.12f}" for v in row[3:] * 1e-3))
+        lines.append(
+            text + "".join(f" {v:.9f}" for v in row[:3] * 1e-3) + "".join(f" {v:.12f}" for v in row[3:] * 1e-3)
+        )
     with written_atomically(path) as temporary:
         temporary.write_text("\n".join(lines) + "\n")

@@ -7,13 +7,15 @@ elements, TOML settings. An OEM or two-line elements give the initial orbit.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from estimator.models.earth_orientation import utc_text
+from estimator.models.earth_orientation import tai_from_utc, utc_text
 from estimator.models.errors import FileFormatError, RequestError
 from problems.geo_orbit.settings import OrbitSettings, read_toml, settings_from
 from problems.geo_orbit.tracking import Observations, Tracking, deep_merged
@@ -50,8 +52,12 @@ def kind_of(path: Path) -> str:
         return "aer"
     if len(words) >= 6 and re.fullmatch(r"[\d.]+", words[0]) and words[2].isdigit():
         return "gmd"
-    raise FileFormatError("this is no tracking file of a known kind", where=str(path), value=(rows or [""])[0][:60],
-                          limit=".aer, .gmd, CCSDS TDM; with .in, .toml, CCSDS OEM, two-line elements, IERS Bulletin B")
+    raise FileFormatError(
+        "this is no tracking file of a known kind",
+        where=str(path),
+        value=(rows or [""])[0][:60],
+        limit=".aer, .gmd, CCSDS TDM; with .in, .toml, CCSDS OEM, two-line elements, IERS Bulletin B",
+    )
 
 
 def read_files(paths: Sequence[Path], settings_file: Path | None = None) -> tuple[Tracking, OrbitSettings]:
@@ -100,8 +106,11 @@ def read_files(paths: Sequence[Path], settings_file: Path | None = None) -> tupl
                 more, _ = read_files([Path(name)])
                 tracking = tracking.merged(more)
     if not tracking.observations:
-        raise RequestError("none of the files holds measurements", where="FILES",
-                           remedy="give a tracking file: .aer, .gmd or CCSDS TDM")
+        raise RequestError(
+            "none of the files holds measurements",
+            where="FILES",
+            remedy="give a tracking file: .aer, .gmd or CCSDS TDM",
+        )
     if not tracking.stations and not tables.get("stations"):
         beside = _settings_beside(paths)
         if beside is not None:
@@ -112,6 +121,7 @@ def read_files(paths: Sequence[Path], settings_file: Path | None = None) -> tupl
     scale = merged.get("measurements", {}).get("time_scale", "file")
     if scale not in ("file", "UTC"):
         tracking = _rescaled(tracking, str(scale))
+    tracking = _within(tracking, merged.get("measurements", {}))
     if bulletins:
         merged = deep_merged(merged, {"earth_orientation": {"bulletins": bulletins}})
     if elements and "orbit" not in tables:
@@ -127,6 +137,24 @@ def _settings_beside(paths: Sequence[Path]) -> Path | None:
     return None
 
 
+def _within(tracking: Tracking, measurements: Mapping[str, Any]) -> Tracking:
+    """The observations between ``start`` and ``stop`` (UTC texts) of the settings.
+
+    Raises:
+        RequestError: none is left.
+    """
+    first, last = measurements.get("start"), measurements.get("stop")
+    if first is None and last is None:
+        return tracking
+    low = tai_from_utc([str(first)])[0] if first is not None else np.datetime64("1950-01-01", "us")
+    high = tai_from_utc([str(last)])[0] if last is not None else np.datetime64("2150-01-01", "us")
+    kept = [o.subset((o.time >= low) & (o.time <= high)) for o in tracking.observations]
+    kept = [o for o in kept if len(o.time)]
+    if not kept:
+        raise RequestError("no measurement lies between start and stop", where="[measurements]", value=f"{first} to {last}")
+    return replace(tracking, observations=tuple(kept))
+
+
 def _rescaled(tracking: Tracking, scale: str) -> Tracking:
     """Readings that the file gave as UTC, taken in another scale."""
     from problems.readers.tracking_ccsds import tai_from_text
@@ -134,8 +162,11 @@ def _rescaled(tracking: Tracking, scale: str) -> Tracking:
     observations = []
     for o in tracking.observations:
         texts = [utc_text(t) for t in o.time]
-        observations.append(Observations(o.kind, o.receiver, o.transmitter, tai_from_text(texts, scale, o.source),
-                                         o.value, o.source, o.line))
+        observations.append(
+            Observations(
+                o.kind, o.receiver, o.transmitter, tai_from_text(texts, scale, o.source), o.value, o.source, o.line
+            )
+        )
     return Tracking(tuple(observations), tracking.stations, tracking.settings, tracking.satellite)
 
 
@@ -144,8 +175,12 @@ def _orbit_table(element: tuple[Path, str], first: np.datetime64) -> dict[str, A
     if kind == "oem":
         ephemeris = read_oem(path)
         index = int(np.argmin(np.abs((ephemeris.time - first) / np.timedelta64(1, "us"))))
-        return {"epoch": utc_text(ephemeris.time[index]), "frame": ephemeris.frame,
-                "position_m": ephemeris.state[index, :3].tolist(), "velocity_m_s": ephemeris.state[index, 3:].tolist()}
+        return {
+            "epoch": utc_text(ephemeris.time[index]),
+            "frame": ephemeris.frame,
+            "position_m": ephemeris.state[index, :3].tolist(),
+            "velocity_m_s": ephemeris.state[index, 3:].tolist(),
+        }
     return {"tle": list(nearest_elements(path, first))}
 
 
@@ -157,13 +192,14 @@ def nearest_elements(path: Path, instant: np.datetime64) -> tuple[str, str]:
     """
     lines = [line.rstrip() for line in path.read_text(errors="replace").splitlines()]
     best: tuple[float, tuple[str, str]] | None = None
-    for one, two in zip(lines[:-1], lines[1:], strict=True):
+    for one, two in pairwise(lines):
         if one.startswith("1 ") and two.startswith("2 "):
             try:
                 year, day = int(one[18:20]), float(one[20:32])
             except ValueError as error:
-                raise FileFormatError("the epoch of an element set cannot be read", where=str(path),
-                                      value=one[:40]) from error
+                raise FileFormatError(
+                    "the epoch of an element set cannot be read", where=str(path), value=one[:40]
+                ) from error
             year += 2000 if year < 57 else 1900
             epoch = np.datetime64(f"{year}-01-01T00:00:00", "us") + np.timedelta64(round((day - 1) * 86400e6), "us")
             gap = abs(float((epoch - instant) / np.timedelta64(1, "us")))

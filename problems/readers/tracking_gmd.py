@@ -32,29 +32,49 @@ def read_gmd(path: Path) -> Tracking:
         try:
             day, kind, station, satellite, value = float(words[0]), words[1], words[3], words[4], float(words[5])
         except (IndexError, ValueError) as error:
-            raise FileFormatError("this is no record 'day Range 9002 station satellite km'", where=f"{path}:{number}",
-                                  value=line.strip()[:80]) from error
+            raise FileFormatError(
+                "this is no record 'day Range 9002 station satellite km'",
+                where=f"{path}:{number}",
+                value=line.strip()[:80],
+            ) from error
         if kind.lower() not in ("range", "range_km", "gn_range"):
-            raise FileFormatError("this kind of record is not known", where=f"{path}:{number}", value=kind,
-                                  limit="Range")
+            raise FileFormatError(
+                "this kind of record is not known", where=f"{path}:{number}", value=kind, limit="Range"
+            )
         satellites.add(satellite)
         rows.setdefault((station, satellite), []).append((day, value, number))
     if not rows:
         raise FileFormatError("the file holds no measurements", where=str(path))
     if len(satellites) > 1:
-        raise FileFormatError("the file holds more than one satellite", where=str(path),
-                              value=", ".join(sorted(satellites)), remedy="split it by satellite")
+        raise FileFormatError(
+            "the file holds more than one satellite",
+            where=str(path),
+            value=", ".join(sorted(satellites)),
+            remedy="split it by satellite",
+        )
     observations = []
     for (station, _), entries in rows.items():
         days = np.array([e[0] for e in entries])
         mjd = days + _MJD_LESS if np.median(days) < _SPAN[0] else days
         if mjd.min() < _SPAN[0] or mjd.max() > _SPAN[1]:
-            raise FileFormatError("this day count is no modified Julian date (less 30000)", where=str(path),
-                                  value=f"{days.min():.3f} to {days.max():.3f}", limit=f"{_SPAN[0]:.0f} to {_SPAN[1]:.0f}")
+            raise FileFormatError(
+                "this day count is no modified Julian date (less 30000)",
+                where=str(path),
+                value=f"{days.min():.3f} to {days.max():.3f}",
+                limit=f"{_SPAN[0]:.0f} to {_SPAN[1]:.0f}",
+            )
         order = np.argsort(mjd, kind="stable")
-        observations.append(Observations("range", station, station, tai_from_mjd(mjd)[order],
-                                         1e3 * np.array([[e[1]] for e in entries])[order], path.name,
-                                         np.array([e[2] for e in entries])[order]))
+        observations.append(
+            Observations(
+                "range",
+                station,
+                station,
+                tai_from_mjd(mjd)[order],
+                1e3 * np.array([[e[1]] for e in entries])[order],
+                path.name,
+                np.array([e[2] for e in entries])[order],
+            )
+        )
     return Tracking(tuple(observations), settings={"measurements": {"range": "sum"}}, satellite=next(iter(satellites)))
 
 

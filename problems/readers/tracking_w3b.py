@@ -36,8 +36,11 @@ def read_aer(path: Path) -> Tracking:
             if len(values) != sizes[kind]:
                 raise ValueError(kind)
         except (IndexError, ValueError, KeyError) as error:
-            raise FileFormatError("this line is neither a RANGE (km) nor an AZ_EL (degrees) record",
-                                  where=f"{path}:{number}", value=line.strip()[:80]) from error
+            raise FileFormatError(
+                "this line is neither a RANGE (km) nor an AZ_EL (degrees) record",
+                where=f"{path}:{number}",
+                value=line.strip()[:80],
+            ) from error
         rows.setdefault((kind, station), []).append((words[0], values, number))
     if not rows:
         raise FileFormatError("the file holds no measurements", where=str(path))
@@ -49,9 +52,17 @@ def read_aer(path: Path) -> Tracking:
             raise FileFormatError(error.what, where=str(path), value=error.value, limit=error.limit) from error
         scale = 1e3 if kind == "RANGE" else _DEGREE
         order = np.argsort(time, kind="stable")
-        observations.append(Observations(
-            "range" if kind == "RANGE" else "azimuth_elevation", station, station, time[order],
-            scale * np.array([e[1] for e in entries])[order], path.name, np.array([e[2] for e in entries])[order]))
+        observations.append(
+            Observations(
+                "range" if kind == "RANGE" else "azimuth_elevation",
+                station,
+                station,
+                time[order],
+                scale * np.array([e[1] for e in entries])[order],
+                path.name,
+                np.array([e[2] for e in entries])[order],
+            )
+        )
     return Tracking(tuple(observations))
 
 
@@ -76,8 +87,9 @@ def read_orbit_determination_input(path: Path) -> Tracking:
         else:
             lists.setdefault(key, {})[int(index)] = value
     if "orbit.date" not in single or "ground.station.name" not in lists:
-        raise FileFormatError("no orbit.date or no ground.station.name: this is no orbit determination input",
-                              where=str(path))
+        raise FileFormatError(
+            "no orbit.date or no ground.station.name: this is no orbit determination input", where=str(path)
+        )
 
     def number_of(key: str, default: float = 0.0, index: int | None = None) -> float:
         text = single.get(key) if index is None else lists.get(key, {}).get(index)
@@ -96,43 +108,68 @@ def read_orbit_determination_input(path: Path) -> Tracking:
     for i, name in sorted(lists["ground.station.name"].items()):
         g = "ground.station."
         biases = (["range"] if true(g + "range.bias.estimated", i) else []) + (
-            ["azimuth", "elevation"] if true(g + "az.el.biases.estimated", i) else [])
+            ["azimuth", "elevation"] if true(g + "az.el.biases.estimated", i) else []
+        )
         stations[name] = Station(
-            name, number_of(g + "latitude", index=i) * _DEGREE, number_of(g + "longitude", index=i) * _DEGREE,
+            name,
+            number_of(g + "latitude", index=i) * _DEGREE,
+            number_of(g + "longitude", index=i) * _DEGREE,
             number_of(g + "altitude", index=i),
-            {"range": number_of(g + "range.sigma", 20.0, i), "azimuth": number_of(g + "azimuth.sigma", 0.02, i) * _DEGREE,
-             "elevation": number_of(g + "elevation.sigma", 0.02, i) * _DEGREE},
-            {"range": number_of(g + "range.bias", index=i), "azimuth": number_of(g + "azimuth.bias", index=i) * _DEGREE,
-             "elevation": number_of(g + "elevation.bias", index=i) * _DEGREE}, tuple(biases))
+            {
+                "range": number_of(g + "range.sigma", 20.0, i),
+                "azimuth": number_of(g + "azimuth.sigma", 0.02, i) * _DEGREE,
+                "elevation": number_of(g + "elevation.sigma", 0.02, i) * _DEGREE,
+            },
+            {
+                "range": number_of(g + "range.bias", index=i),
+                "azimuth": number_of(g + "azimuth.bias", index=i) * _DEGREE,
+                "elevation": number_of(g + "elevation.bias", index=i) * _DEGREE,
+            },
+            tuple(biases),
+        )
     first = min(stations, key=lambda n: list(stations).index(n))
     index = next(i for i, n in lists["ground.station.name"].items() if n == first)
     forces: dict[str, Any] = {
-        "degree": int(number_of("central.body.degree", 0)), "order": int(number_of("central.body.order", 0)),
-        "sun": true("third.body.sun"), "moon": true("third.body.moon"),
+        "degree": int(number_of("central.body.degree", 0)),
+        "order": int(number_of("central.body.order", 0)),
+        "sun": true("third.body.sun"),
+        "moon": true("third.body.moon"),
     }
     if true("solar.radiation.pressure"):
-        forces["solar_radiation_pressure"] = {"coefficient": number_of("solar.radiation.pressure.cr", 2.0),
-                                              "estimated": true("solar.radiation.pressure.cr.estimated")}
+        forces["solar_radiation_pressure"] = {
+            "coefficient": number_of("solar.radiation.pressure.cr", 2.0),
+            "estimated": true("solar.radiation.pressure.cr.estimated"),
+        }
     if true("drag"):
         forces["drag"] = {"coefficient": number_of("drag.cd", 2.0), "estimated": true("drag.cd.estimated")}
     polynomials = lists.get("polynomial.acceleration.name", {})
     if polynomials:
         terms = max(len(c.split(",")) for c in lists["polynomial.acceleration.coefficients"].values())
         forces["constant_acceleration"] = {
-            "terms": min(terms, 2), "frame": "celestial",
-            "estimated": any(v.lower() == "true" for v in lists.get("polynomial.acceleration.estimated", {}).values())}
+            "terms": min(terms, 2),
+            "frame": "celestial",
+            "estimated": any(v.lower() == "true" for v in lists.get("polynomial.acceleration.estimated", {}).values()),
+        }
     settings: dict[str, Any] = {
-        "satellite": {"mass_kg": number_of("mass", 1000.0),
-                      "area_m2": number_of("solar.radiation.pressure.area", number_of("drag.area", 10.0))},
+        "satellite": {
+            "mass_kg": number_of("mass", 1000.0),
+            "area_m2": number_of("solar.radiation.pressure.area", number_of("drag.area", 10.0)),
+        },
         "forces": forces,
-        "orbit": {"epoch": single["orbit.date"], "frame": single.get("inertial.frame", "EME2000"),
-                  "position_m": [number_of(f"orbit.cartesian.p{a}") for a in "xyz"],
-                  "velocity_m_s": [number_of(f"orbit.cartesian.v{a}") for a in "xyz"]},
+        "orbit": {
+            "epoch": single["orbit.date"],
+            "frame": single.get("inertial.frame", "EME2000"),
+            "position_m": [number_of(f"orbit.cartesian.p{a}") for a in "xyz"],
+            "velocity_m_s": [number_of(f"orbit.cartesian.v{a}") for a in "xyz"],
+        },
         "measurements": {
-            "range": "half", "time_tag": "reception", "onboard_range_bias_m": number_of("onboard.range.bias"),
+            "range": "half",
+            "time_tag": "reception",
+            "onboard_range_bias_m": number_of("onboard.range.bias"),
             "troposphere": true("ground.station.range.tropospheric.correction", index),
             "refraction": true("ground.station.elevation.refraction.correction", index),
-            "rejection_sigmas": number_of("range.outlier.rejection.multiplier", 6.0)},
+            "rejection_sigmas": number_of("range.outlier.rejection.multiplier", 6.0),
+        },
     }
     bulletins = sorted(path.parent.glob("bulletinb-*.txt"))
     if bulletins:
