@@ -208,7 +208,7 @@ def _sizes(explanation: Explanation, name: str) -> str:
     parameters = parameters_of(explanation.findings.final, explanation.instance(name))
     shown = [f"{key} {number(p['value'], p['sigma'], p['unit'])}" for key, p in parameters.items()]
     if len(shown) > 8:
-        shown = [*shown[:6], f"and {len(shown) - 6} more"]
+        shown = [*shown[:3], f"and {len(shown) - 3} more"]
     return ", ".join(shown)
 
 

@@ -34,6 +34,7 @@ from problems.alignment.explain_answer import (
 )
 
 BINS = 200  # points of a curve, over all arcs of a channel
+FEWEST_IN_BIN = 12  # samples behind a point of a curve, on average
 CLOUD = 2500  # raw samples behind a curve
 COMPONENT_COLOURS = ("#2166ac", "#d6604d", "#4d9221", "#8073ac", "#b8860b", "#35978f")
 BEFORE, AFTER = "#b2182b", "#2166ac"
@@ -154,6 +155,7 @@ def _matched(first: Estimate, second: Estimate) -> list[Any]:
 def binned(item: Trace, values: np.ndarray, mask: np.ndarray, bins: int = BINS) -> tuple[np.ndarray, np.ndarray]:
     """Means in bins of time within arcs: places (k,) and values (k, m), a NaN between arcs so that lines break."""
     total = sum(stop - start for start, stop, _ in item.edges) or 1.0
+    bins = min(bins, max(3 * len(item.edges), int(mask.sum()) // FEWEST_IN_BIN))
     places: list[np.ndarray] = []
     means: list[np.ndarray] = []
     for start, stop, _ in item.edges:
@@ -466,10 +468,12 @@ def _finding_block(explanation: Explanation, finding: Finding, before: Sequence[
     block.append(_table([("root mean square miss", False), ("fitted, before", True), ("after", True),
                          ("held out, before", True), ("after", True), ("floor", True), ("unit", False),
                          ("held out over floor", True), ("held-out values", True)], proof_rows))
-    moved = [(n, s) for n, s in finding.moved.items()]
+    moved = [(n, s) for n, s in finding.moved.items() if s >= 0.1]
     if moved:
         block.append("<p>What the others moved by when it was added: " + ", ".join(
             f"{_e(n)} {s:.1f} sigma" for n, s in sorted(moved, key=lambda item: -item[1])) + ".</p>")
+    else:
+        block.append("<p>None of the other unknowns moved by a tenth of a sigma when it was added.</p>")
     block.append(f"<p class='soft small'>Zero when: {_e(effect.zero)}. Reference: {_e(effect.reference)}.</p>")
     return "".join(block)
 
