@@ -271,16 +271,23 @@ def test_held_out_samples_leave_the_fit_alone_and_tell_the_miss() -> None:
     assert inside.square == pytest.approx(sum(p.cost for p in first.parts), rel=1e-9)
 
 
-def test_an_addition_that_does_not_pay_on_held_out_data_is_told() -> None:
-    base = misfit_like(100.0, 100)
-    assert pays(base, misfit_like(60.0, 100))
-    assert not pays(base, misfit_like(140.0, 100))
+def test_an_addition_pays_where_held_out_samples_bear_it_out() -> None:
+    """A curve on the second beam that goes on into the held-out end pays; one that turns round there does not."""
+    draw = np.random.default_rng(8)
+    time = np.linspace(-1, 1, 300)
+    used = time < 0.5
+    line = (2 + time)[:, None] * np.ones(2)
+    noise = 0.1 * draw.standard_normal(line.shape)
 
+    def verdict(curve: np.ndarray) -> bool:
+        measured = line + noise
+        measured[:, 1] += curve
+        plain = solve(problem_of(time, measured, 0.1, accepted=used))
+        bent = solve(problem_of(time, measured, 0.1, curved=True, accepted=used).freeing("candidate"))
+        return pays(plain.problem, plain.parts, bent.problem, bent.parts, ("doppler",))
 
-def misfit_like(square: float, count: int) -> dict[str, object]:
-    from estimator.discrepancy.proof import HeldOut
-
-    return {"doppler": HeldOut("doppler", "Hz", float(np.sqrt(square / count)), 1.0, square, count)}  # type: ignore
+    assert verdict(0.5 * time**2)
+    assert not verdict(np.where(used, 0.5 * time**2, -1.0))
 
 
 def test_rows_of_rejected_samples_are_silent() -> None:

@@ -1,9 +1,10 @@
 """Where model and data disagree: channel, arcs, time scale and size, with a test that holds for any sampling.
 
-The residuals of every arc and component are projected on a few smooth functions of time (Legendre polynomials of the
-arc), with everything that the fit absorbs projected out of them first; the sum of squares is chi-square without a gap.
-Irregular sampling and gaps do not matter, and noise that is merely larger than declared is told apart from structure,
-because its scale is taken from successive differences.
+Two kinds of structure are looked for. Slow: the residuals of every arc and component are projected on a few smooth
+functions of time (Legendre polynomials of the arc), with everything that the fit absorbs projected out of them first;
+the sum of squares is chi-square without a gap. Fast: the sum of products of neighbouring samples of a component is
+normal without a gap. Neither minds irregular sampling or gaps. A sum of squares that is too large without either is
+noise above the declared one, and said as such.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
 from estimator.discrepancy.score import Stack
 from estimator.problem import Problem
@@ -85,6 +86,7 @@ class _Cell:
     smooth_power: float
     dominant: int
     floor: float
+    time_scale: float | None = None
 
 
 def find_gap(problem: Problem, stacked: Stack, parts: Sequence[Linearization]) -> Gap:
@@ -102,8 +104,14 @@ def find_gap(problem: Problem, stacked: Stack, parts: Sequence[Linearization]) -
             cells += _kernel_cells(residual, part, rows, stacked)
         elif isinstance(residual, TrajectoryResidual):
             cells += _position_cells(residual, part)
+        cells += _serial_cells(residual, part, stacked.scale[residual.name])
     tests = max(len(cells), 1)
-    white = tuple((name, s) for name, s in stacked.scale.items() if s > 1)
+    structured = {c.channel for c in cells if c.p_value < LEVEL / tests}
+    white = {name: s for name, s in stacked.scale.items() if s > 1}
+    for residual, part in zip(problem.residuals, parts, strict=True):
+        excess = _noise_excess(part, stacked, stacked.blocks[residual.name], len(problem.residuals))
+        if excess > 1 and residual.channel not in structured:
+            white[residual.name] = max(white.get(residual.name, 1.0), excess)
     threshold = LEVEL / tests
     significant = [c for c in cells if c.p_value < threshold]
     places = []
@@ -113,7 +121,7 @@ def find_gap(problem: Problem, stacked: Stack, parts: Sequence[Linearization]) -
         unit = next(r.unit for r in problem.residuals if r.channel == channel)
         places.append(_place(channel, unit, mine, everything, tests))
     smallest = min((c.p_value for c in cells), default=1.0)
-    return Gap(tuple(sorted(places, key=lambda p: p.p_value)), white, min(1.0, smallest * tests))
+    return Gap(tuple(sorted(places, key=lambda p: p.p_value)), tuple(white.items()), min(1.0, smallest * tests))
 
 
 def _kernel_cells(residual: KernelResidual, part: Linearization, rows: slice, stacked: Stack) -> list[_Cell]:
@@ -170,6 +178,60 @@ def _position_cells(residual: TrajectoryResidual, part: Linearization) -> list[_
     return cells
 
 
+def _noise_excess(part: Linearization, stacked: Stack, rows: slice, residuals: int) -> float:
+    """Root mean square of the whitened residual where its sum of squares is improbably large, 1 else."""
+    total = float(np.sum(part.weight[:, None] * part.whitened**2))
+    degrees = part.measurements - float(np.sum(stacked.basis[rows] ** 2))
+    if degrees < 1 or chi2.sf(total, degrees) * residuals > LEVEL:
+        return 1.0
+    return float(np.sqrt(total / degrees))
+
+
+def _serial_cells(residual: object, part: Linearization, scale: float) -> list[_Cell]:
+    """Products of neighbouring samples of each component, over all arcs together."""
+    if isinstance(residual, KernelResidual):
+        used = np.flatnonzero(part.weight > 0)
+        order = used[np.lexsort((residual.time[used], residual.arc[used]))]
+        series, time, arc = part.whitened[order] / scale, residual.time[order], residual.arc[order]
+        floor = np.sqrt(np.mean(residual.standard_deviation**2, axis=0))
+        label = residual.arc_names[0] if len(residual.arc_names) == 1 else "all arcs"
+    elif isinstance(residual, TrajectoryResidual):
+        used = np.flatnonzero(residual.weights[:, 0] > 0)
+        series, time = (part.residual / residual.standard_deviation)[used], residual.time[used]
+        arc = np.zeros(len(used), dtype=int)
+        floor = np.sqrt(np.mean(residual.standard_deviation**2, axis=0))
+        label = "all positions"
+    else:
+        return []
+    if len(series) < 4 * SMOOTH:
+        return []
+    step = np.diff(time)
+    pairs = (arc[1:] == arc[:-1]) & (step < 3.5 * np.median(step[step > 0]))
+    count = int(pairs.sum())
+    if count < 4 * SMOOTH:
+        return []
+    cells = []
+    for component in range(series.shape[1]):
+        x = series[:, component]
+        spread = float(np.mean(x**2))
+        product = float(np.sum(x[1:][pairs] * x[:-1][pairs]))
+        z = product / (np.sqrt(count) * spread)
+        cells.append(_Cell(residual.channel, label, component, count, float(time[0]), float(time[-1]), z * z, 1,
+                           float(norm.sf(z)), max(product, 0.0), 1, float(floor[component % len(floor)]),
+                           _correlation_time(x, float(np.median(step[pairs])))))
+    return cells
+
+
+def _correlation_time(x: np.ndarray, step: float) -> float:
+    """Lag (s) at which the autocorrelation has fallen to 1/e of its value at the first lag."""
+    centred = x - x.mean()
+    size = 1 << int(np.ceil(np.log2(2 * len(x))))
+    spectrum = np.abs(np.fft.rfft(centred, size)) ** 2
+    correlation = np.fft.irfft(spectrum, size)[: max(len(x) // 2, 3)]
+    fallen = np.flatnonzero(correlation[1:] < correlation[1] / np.e)
+    return float((fallen[0] + 1 if len(fallen) else len(correlation)) * step)
+
+
 def _marked(residual: TrajectoryResidual, used: np.ndarray) -> list[tuple[str, np.ndarray]]:
     """Stretches of the positions that are looked at: those with a known attitude where there are any, and the rest."""
     count = int(used.sum())
@@ -183,6 +245,9 @@ def _marked(residual: TrajectoryResidual, used: np.ndarray) -> list[tuple[str, n
 
 
 def _place(channel: str, unit: str, cells: list[_Cell], everything: list[_Cell], tests: int) -> Place:
+    # Slow structure says which arcs; products of neighbours, taken over all of them, speak where it finds none.
+    cells = [c for c in cells if c.time_scale is None] or cells
+    everything = [c for c in everything if c.time_scale is None]
     arcs = tuple(dict.fromkeys(c.arc for c in cells))
     power: dict[int, float] = {}
     for c in cells:
@@ -196,13 +261,16 @@ def _place(channel: str, unit: str, cells: list[_Cell], everything: list[_Cell],
     dominant = int(np.bincount([c.dominant for c in cells]).argmax())
     length = float(np.median([c.stop - c.start for c in cells]))
     scale = length / dominant if dominant else max(length, float(cells[-1].stop - cells[0].start))
+    serial = [c.time_scale for c in cells if c.time_scale is not None]
+    if serial and len(serial) == len(cells):
+        scale = float(np.median(serial))
     p = min(1.0, min(c.p_value for c in cells) * tests)
     which = {"doppler": "beam", "star_tracker": "axis", "gnss": "axis"}.get(channel, "component")
     all_components = {c.component for c in everything}
     parts = "all " + ("beams" if which == "beam" else "axes") if set(components) == all_components else \
         f"{which} " + ", ".join(str(c) for c in components)
     all_arcs = {c.arc for c in everything}
-    where = "every arc" if set(arcs) == all_arcs else "arcs " + ", ".join(arcs)
+    where = "every arc" if set(arcs) == all_arcs else ("" if serial else "arcs ") + ", ".join(arcs)
     shape = "constant within an arc" if dominant == 0 else f"changes within {scale:.3g} s"
     value, noise, shown = _readable(excess, floor, unit)
     size = f"{value:.3g} {shown} RMS over {noise:.3g} {shown}"
