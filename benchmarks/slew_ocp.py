@@ -126,7 +126,8 @@ def random_study(count: int, solver: str = "ipopt") -> dict[str, Any]:
             warm.append(time.process_time() - t1)
             replans.append(warm[-1] / (t1 - t0))
     load.append(os.getloadavg()[0])
-    return {"count": count, "load_average_of_the_machine": load, "processors": os.cpu_count(), "solver": solver, "solved": len(own), "failures": failures, "process_s": percentiles(own),
+    return {"count": count, "load_average_of_the_machine": load, "processors": os.cpu_count(),
+            "solver": solver, "solved": len(own), "failures": failures, "process_s": percentiles(own),
             "wall_s": percentiles(wall), "largest_excess": float(max(excess)),
             "largest_terminal_error_arcsec": float(max(attitude)),
             "mrp5_over_optimum": percentiles(over5), "replan_over_cold": percentiles(replans),

@@ -208,22 +208,126 @@ def test_leap_second_is_in_the_calendar(tmp_path: Path) -> None:
                                             "2017-01-01T00:00:00.000000000"]
 
 
-def test_aem_is_read_by_orekit(tmp_path: Path) -> None:
-    orekit = pytest.importorskip("orekit_jpype", reason="orekit-jpype is not installed")
-    orekit.initVM()
-    from org.orekit.data import DataContext, DirectoryCrawler, LazyLoadedDataContext  # noqa: F401
+@pytest.fixture(scope="module")
+def orekit(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Orekit in a Java machine of its own, with leap seconds and an Earth that has a name and a mass, nothing else."""
+    package = pytest.importorskip("orekit_jpype", reason="orekit-jpype is not installed")
+    import jpype
+
+    if not jpype.isJVMStarted():
+        try:
+            package.initVM()
+        except (jpype.JVMNotFoundException, OSError, RuntimeError) as error:
+            pytest.skip(f"no Java machine: {error}")
+    from java.io import File
+    from org.orekit.data import DataContext, DataSource, DirectoryCrawler
     from org.orekit.files.ccsds.ndm import ParserBuilder
 
-    _, series = wavy_series(time_system="TAI")
-    write_aem(tmp_path / "a.aem", series)
-    from java.io import File
-    from org.orekit.data import DataSource
+    folder = tmp_path_factory.mktemp("orekit")
+    (folder / "tai-utc.dat").write_text("".join(
+        f" {year} {month} =JD {day}  TAI-UTC= {offset:5.1f}       S + (MJD - 41317.) X 0.0      S\n"
+        for year, month, day, offset in ((1972, "JAN  1", 2441317.5, 10), (2015, "JUL  1", 2457204.5, 36),
+                                         (2017, "JAN  1", 2457754.5, 37))))
 
-    message = ParserBuilder().buildAemParser().parseMessage(DataSource(File(str(tmp_path / "a.aem"))))
-    coordinates = message.getSegments().get(0).getAngularCoordinates()
-    rotation = coordinates.get(coordinates.size() - 1).getRotation()
-    q = np.array([rotation.getQ0(), rotation.getQ1(), rotation.getQ2(), rotation.getQ3()])
-    assert kin.angle_between(q, series.quaternion[-1]) < 1e-9
+    @jpype.JImplements("org.orekit.bodies.CelestialBody", deferred=True)
+    class Earth:
+        """The centre that the metadata name; its ephemeris is never asked for."""
+
+        @jpype.JOverride
+        def getName(self) -> str:
+            return "Earth"
+
+        @jpype.JOverride
+        def getGM(self) -> float:
+            return 3.986004418e14  # m3/s2
+
+        def _none(self, *arguments: Any) -> Any:
+            raise NotImplementedError
+
+        getInertiallyOrientedFrame = getBodyOrientedFrame = toFieldPVCoordinatesProvider = jpype.JOverride(_none)
+        getPVCoordinates = getPosition = jpype.JOverride(_none)
+
+    @jpype.JImplements("org.orekit.bodies.CelestialBodyLoader", deferred=True)
+    class Loader:
+        """Gives that Earth."""
+
+        @jpype.JOverride
+        def loadCelestialBody(self, name: str) -> Any:
+            return Earth()
+
+    context = DataContext.getDefault()
+    context.getDataProvidersManager().addProvider(DirectoryCrawler(File(str(folder))))
+    context.getCelestialBodies().addCelestialBodyLoader("Earth", Loader())
+
+    def read(path: Path) -> Any:
+        builder = ParserBuilder()
+        parser = builder.buildAemParser() if path.suffix == ".aem" else builder.buildOemParser()
+        return parser.parseMessage(DataSource(File(str(path)))).getSegments()
+
+    return read
+
+
+def orekit_attitudes(segment: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Seconds from the first instant, ``inertial_from_body`` and body rate, as Orekit applies them to vectors."""
+    from org.hipparchus.geometry.euclidean.threed import Vector3D
+    from scipy.spatial.transform import Rotation
+
+    times, matrices, rates = [], [], []
+    coordinates = segment.getAngularCoordinates()
+    first = coordinates.get(0).getDate()
+    for c in coordinates:
+        times.append(c.getDate().durationFrom(first))
+        # columns: body coordinates of the inertial axes
+        columns = [c.getRotation().applyTo(axis) for axis in (Vector3D.PLUS_I, Vector3D.PLUS_J, Vector3D.PLUS_K)]
+        matrices.append([[v.getX(), v.getY(), v.getZ()] for v in columns])
+        w = c.getRotationRate()
+        rates.append([w.getX(), w.getY(), w.getZ()])
+    q = Rotation.from_matrix(np.array(matrices)).as_quat(scalar_first=True)
+    return np.array(times), q, np.array(rates)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("time_system, frame", [("UTC", "EME2000"), ("UTC", "GCRF"), ("TAI", "EME2000"),
+                                                ("TT", "EME2000"), ("GPS", "GCRF")])
+def test_aem_is_read_by_orekit(tmp_path: Path, orekit: Any, version: int, time_system: str, frame: str) -> None:
+    profile, series = wavy_series(epoch="2016-12-31T23:59:30", time_system=time_system, reference_frame=frame)
+    write_aem(tmp_path / "a.aem", series, version=version, comment="across a leap second of UTC")
+    segments = orekit(tmp_path / "a.aem")
+    assert segments.size() == 1
+    metadata = segments.get(0).getMetadata()
+    endpoints = metadata.getEndpoints()
+    assert endpoints.getFrameA().getName() == frame
+    assert endpoints.getFrameB().getName() == "SC_BODY_1"
+    assert endpoints.isA2b()
+    assert metadata.getTimeSystem().name() == time_system
+    times, q, rates = orekit_attitudes(segments.get(0))
+    assert np.allclose(times, series.times, atol=2e-9)
+    truth = profile.motion(series.times)
+    assert np.max(kin.angle_between(q, truth.quaternion)) < 1e-9
+    if version == 2:
+        assert np.allclose(rates, truth.rate, atol=1e-12)
+
+
+def test_files_of_the_slew_command_and_an_orbit_are_read_by_orekit(tmp_path: Path, orekit: Any) -> None:
+    run, application = runner()
+    assert run.invoke(application, [str(EXAMPLE), "--json", "--export", str(tmp_path / "s.aem")]).exit_code == 0
+    request = read_slew_request(EXAMPLE)
+    _, q, rates = orekit_attitudes(orekit(tmp_path / "s.aem").get(0))
+    assert kin.angle_between(q[0], request.start.quaternion) < 1e-9
+    assert np.allclose(rates[0], request.start.rate, atol=1e-12)
+    assert kin.angle_between(q[-1], request.stop.quaternion) < 1e-8  # the end of the file is on a nanosecond
+    assert np.allclose(rates[-1], request.stop.rate, atol=1e-8)
+    times = np.arange(10.0)
+    position = 7e6 * np.stack([np.cos(times / 900), np.sin(times / 900), 0 * times], axis=1)
+    velocity = 7e6 / 900 * np.stack([-np.sin(times / 900), np.cos(times / 900), 0 * times], axis=1)
+    write_oem(tmp_path / "a.oem", OrbitSeries(times, position, velocity, epoch="2025-06-21T08:30:00",
+                                              reference_frame="GCRF"))
+    segment = orekit(tmp_path / "a.oem").get(0)
+    assert segment.getMetadata().getReferenceFrame().getName() == "GCRF"
+    for k, state in enumerate(segment.getCoordinates()):
+        p, v = state.getPosition(), state.getVelocity()
+        assert np.allclose([p.getX(), p.getY(), p.getZ()], position[k], atol=1e-6)
+        assert np.allclose([v.getX(), v.getY(), v.getZ()], velocity[k], atol=1e-9)
 
 
 def test_oem_holds_the_orbit_in_kilometres(tmp_path: Path) -> None:
