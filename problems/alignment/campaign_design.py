@@ -107,7 +107,7 @@ def efficiency(criterion: Criterion, information: np.ndarray, reference: np.ndar
 
 
 def _value_and_slope(criterion: Criterion, matrix: np.ndarray, interest: np.ndarray) -> tuple[float, np.ndarray]:
-    """The smooth criterion (not its logarithm for A and E) of ``interest`` and minus its derivative along the information."""
+    """The smooth criterion (not its logarithm for A and E) of ``interest``; minus its slope along the information."""
     reach = np.linalg.solve(matrix, interest.T)
     covariance = interest @ reach
     covariance = 0.5 * (covariance + covariance.T)
@@ -135,7 +135,7 @@ def information_about(interest: np.ndarray, information: np.ndarray) -> np.ndarr
 
 
 def slope_of(criterion: Criterion, information: np.ndarray, interest: np.ndarray | None = None) -> np.ndarray:
-    """Minus the derivative (n, n) of the (smooth) criterion along the information (n, n): what more of it would bring."""
+    """Minus the derivative (n, n) of the (smooth) criterion along the information (n, n): what more of it brings."""
     wanted = np.eye(len(information)) if interest is None else interest
     return _value_and_slope(criterion, information, wanted)[1]
 
@@ -187,8 +187,7 @@ def best_shares(candidates: np.ndarray, criterion: Criterion, prior: np.ndarray 
     """The shares of the candidates that make the criterion least, and the bound that proves it.
 
     Minimises the criterion of ``prior + sum_bk w_bk candidates_bk`` under ``w >= 0`` and ``sum_k w_bk = 1/b`` by the
-    multiplicative algorithm (Silvey, Titterington and Torsney 1978), whose every step improves. The bound is the tangent
-    plane at the answer, below the criterion everywhere since the criterion is convex.
+    multiplicative algorithm (Silvey, Titterington and Torsney 1978). The bound is the tangent plane at the answer, below the criterion everywhere since the criterion is convex.
 
     Args:
         candidates: (b, k, n, n) or (k, n, n) information of each candidate if it had the whole time; blocks hold

@@ -1,4 +1,4 @@
-"""The best free rotations and torque pulses: principal axes of inertia and actuator axes as well known as minutes allow.
+"""The best free rotations and torque pulses: principal axes of inertia and actuator axes as known as minutes allow.
 
 What the star tracker tells along an arc depends on the initial rate and on the torque alone (its noise is tied to its
 own axes), so an arc is a candidate with an information matrix: the sensitivities of the joint problem's own equation of
@@ -16,7 +16,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from itertools import product
+from itertools import pairwise, product
 from typing import Any
 
 import casadi as ca
@@ -38,6 +38,7 @@ from problems.alignment.simulation.scenario import Scenario
 
 SHARED = 9  # unknowns of all arcs: normalized inertia 5, its trace 1, actuator 3
 TURN_PER_STEP = 0.02  # rad, longest step of the integration
+LONGEST_STEP = 2.0  # s, the same
 SMALLEST_GAP = 0.01  # of the trace: principal moments closer than this have no axes of their own
 EXCHANGE_STARTS = 6
 REFINEMENTS = 36  # evaluations for each arc and round
@@ -129,7 +130,7 @@ def rotation_request_of(scenario: Scenario, more_shapes: bool = True) -> Rotatio
         first, last = own[0][0], own[-1][1]
         for cuts in ((1.0,), (0.5, 1.0), (0.25, 0.75, 1.0)):
             ends = [first, *(first + c * (last - first) for c in cuts)]
-            shape = tuple((a, b, float((-1) ** k)) for k, (a, b) in enumerate(zip(ends[:-1], ends[1:], strict=True)))
+            shape = tuple((a, b, float((-1) ** k)) for k, (a, b) in enumerate(pairwise(ends)))
             if shape not in shapes:
                 shapes.append(shape)
     request = RotationRequest(
@@ -165,10 +166,10 @@ class _Arcs:
         if torque is not None:
             least = float(np.linalg.eigvalsh(self.request.inertia)[0])
             top += float(np.linalg.norm(torque)) * max(stop - start for start, stop, _ in segments) / least
-        longest = min(max(self.request.sample_step, 0.5), TURN_PER_STEP / max(top, 1e-9))
+        longest = min(LONGEST_STEP, TURN_PER_STEP / max(top, 1e-9))
         cuts = np.unique([0.0, duration, *(t for a, b, _ in segments for t in (a, b))])
         pieces = [cuts[:1]]
-        for a, b in zip(cuts[:-1], cuts[1:], strict=True):
+        for a, b in pairwise(cuts):
             steps = int(np.ceil((b - a) / longest - 1e-9))
             pieces.append(a + (b - a) * np.arange(1, steps + 1) / steps)
         nodes = np.concatenate(pieces)
@@ -267,7 +268,8 @@ class RotationDesign:
             axes.
         value: the criterion.
         bound: no choice among the candidates of this pulse shape has a smaller criterion; the refined arcs may.
-        arc_values: (name, minutes, factor): how much worse the criterion is (a ratio; a difference for D) without the arc.
+        arc_values: (name, minutes, factor): how much worse the criterion is without the arc (a ratio; for D a
+            difference).
         seconds: wall time.
     """
 
@@ -306,7 +308,7 @@ class RotationDesign:
 
 def rotation_information(request: RotationRequest, free_rates: np.ndarray, pulse_shape: Segments,
                          pulse_torques: np.ndarray) -> np.ndarray:
-    """Information (6, 6) 1/rad^2 about principal axes and actuator axes of given arcs (as in :class:`RotationDesign`)."""
+    """Information (6, 6) 1/rad^2 about principal and actuator axes of given arcs (as in :class:`RotationDesign`)."""
     arcs = _Arcs(request)
     total = sum((arcs.information(request.free_duration, rate) for rate in np.reshape(free_rates, (-1, 3))),
                 np.zeros((SHARED, SHARED)))
@@ -364,8 +366,9 @@ def design_rotation(request: RotationRequest, criterion: Criterion = "A", *, ref
     assert best is not None
     value, choice, shape, pulses = best
     if not np.isfinite(value):
-        raise RequestError("no choice of arcs determines principal axes and actuator axes", where="free_arcs, pulse_arcs",
-                           value=(request.free_arcs, request.pulse_arcs), remedy="add an arc or a pulse")
+        raise RequestError("no choice of arcs determines principal axes and actuator axes",
+                           where="free_arcs, pulse_arcs", value=(request.free_arcs, request.pulse_arcs),
+                           remedy="add an arc or a pulse")
     bound = _bound(request, criterion, interest, free, pulses)
     if refine:
         _refine(request, arcs, choice, shape)
@@ -444,7 +447,9 @@ def _refine(request: RotationRequest, arcs: _Arcs, choice: _Choice, shape: Segme
 
             def cost(d: np.ndarray, rest: np.ndarray = rest, part: Any = part, here: float = here) -> float:
                 found = choice.value([rest, part(d)])
-                return (found - here if choice.criterion == "D" else np.log(found / here)) if np.isfinite(found) else 1e3
+                if not np.isfinite(found):
+                    return 1e3
+                return found - here if choice.criterion == "D" else float(np.log(found / here))
 
             answer = minimize(cost, start, method="Nelder-Mead",
                               options={"initial_simplex": simplex, "maxfev": REFINEMENTS, "xatol": 1e-3, "fatol": 1e-4})

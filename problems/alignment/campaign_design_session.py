@@ -1,8 +1,8 @@
 """The best attitude manoeuvre of a Doppler session: the antenna quaternion as well known as its minutes allow.
 
 Doppler sees the antenna's axes only across the velocity, and each epoch carries the star tracker's own error: with
-``G`` the slope of the beams' shifts along a small rotation of the antenna, ``H`` along the tracker's error and ``P`` its
-covariance, one epoch informs by ``G' W G`` with ``W = (sigma_F^2 I + H P H')^-1``. A session in which the velocity
+``G`` the slope of the beams' shifts along a small rotation of the antenna, ``H`` along the tracker's error and ``P``
+its covariance, one epoch informs by ``G' W G`` with ``W = (sigma_F^2 I + H P H')^-1``. A session in which the velocity
 stays in place in the body says nothing about the rotation about it; how fast that rotation becomes known depends on
 where the velocity is led, against the tracker's poor roll axis. :func:`design_session` chooses the manoeuvre.
 
@@ -28,7 +28,15 @@ from estimator.models.earth import GRAVITATIONAL_PARAMETER
 from estimator.models.errors import NotFiniteError, RequestError, ShapeError
 from estimator.models.inertia import inverse3
 from estimator.models.rotations import Matrix
-from problems.alignment.campaign_design import Criterion, best_shares, certified_bound, criterion_function, criterion_value, slope_of
+from problems.alignment.campaign import Campaign
+from problems.alignment.campaign_design import (
+    Criterion,
+    best_shares,
+    certified_bound,
+    criterion_function,
+    criterion_value,
+    slope_of,
+)
 from problems.alignment.kernels import doppler_kernel
 from problems.alignment.simulation.pointing import profile_spline
 from problems.alignment.simulation.scenario import Scenario
@@ -43,8 +51,8 @@ def epoch_information(beams: int) -> ca.Function:
 
     Inputs: ``tracker_from_reference`` (4), ``velocity`` (3, m/s, against the ground, reference axes),
     ``antenna_from_tracker`` (4), ``beam_direction`` (beams, 3), ``carrier`` (Hz), ``doppler_sigma`` (beams, Hz),
-    ``tracker_sigma`` (3, rad about tracker axes). Differentiated from the joint problem's own Doppler kernel; the tracker's
-    errors at the epoch are eliminated, which equals ``W = (sigma_F^2 I + H P H')^-1``.
+    ``tracker_sigma`` (3, rad about tracker axes). Differentiated from the joint problem's own Doppler kernel; the
+    tracker's errors at the epoch are eliminated, which equals ``W = (sigma_F^2 I + H P H')^-1``.
     """
     return _epoch_information(beams)
 
@@ -86,7 +94,11 @@ def antenna_from_orbit(angles: Matrix) -> Matrix:
 
 @dataclass(frozen=True)
 class SlewLimits:
-    """Largest size of each profile angle about antenna x, y, z: ``angle`` rad, ``rate`` rad/s, ``acceleration`` rad/s2."""
+    """Largest size of each profile angle about antenna x, y, z, of its rate and of its acceleration.
+
+    Attributes:
+        angle, rate, acceleration: (3) rad, rad/s, rad/s2.
+    """
 
     angle: tuple[float, float, float]
     rate: tuple[float, float, float]
@@ -242,8 +254,52 @@ def request_of(scenario: Scenario, limits: SlewLimits | None = None, *, duration
         velocity=orbit_axes_velocity(scenario.semi_major_axis, scenario.inclination, u, scenario.earth_rotation_rate))
 
 
+def request_of_campaign(campaign: Campaign, limits: SlewLimits, duration: float, *,
+                        look_angles: np.ndarray | None = None,
+                        antenna_from_tracker: np.ndarray | None = None,
+                        prior: np.ndarray | None = None) -> SessionRequest:
+    """The request for a further session of a campaign that exists: its sensors, beams, orbit and epochs.
+
+    Args:
+        campaign: with Doppler data.
+        limits, duration: of the session to come; s.
+        look_angles: (3) rad, constant part of the angles about antenna x, y, z.
+        antenna_from_tracker: (4), as solved; default the nominal one.
+        prior: (3, 3) 1/rad^2 information that the campaign has given already.
+
+    Raises:
+        RequestError: a campaign without Doppler data.
+    """
+    doppler, tracker, gnss = campaign.doppler, campaign.star_tracker, campaign.gnss
+    if doppler is None or len(doppler.time) < 2 or len(tracker.time) < 2:
+        raise RequestError("a Doppler session needs sensors to be designed for", where="campaign.doppler",
+                           remedy="give a campaign with Doppler and star tracker data")
+    # Earth-fixed positions and their differences: velocity against the ground in orbit axes, mean of the campaign.
+    step = np.diff(gnss.time)
+    near = step < 5 * np.median(step)
+    velocity = (np.diff(gnss.position, axis=0) / step[:, None])[near]
+    position = (0.5 * (gnss.position[1:] + gnss.position[:-1]))[near]
+    inertial = velocity + np.cross([0.0, 0.0, campaign.earth_rotation_rate], position)
+    down = -position / np.linalg.norm(position, axis=1, keepdims=True)
+    across = np.cross(inertial, position)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    axes = np.stack([np.cross(across, down), across, down], axis=1)
+    beams = doppler.beam_direction if doppler.beam_direction.ndim == 2 else doppler.beam_direction.mean(axis=0)
+    mounting = campaign.nominal.antenna_from_tracker if antenna_from_tracker is None else antenna_from_tracker
+    return SessionRequest(
+        duration=duration, limits=limits, antenna_from_tracker=np.asarray(mounting),
+        beam_direction=beams / np.linalg.norm(beams, axis=1, keepdims=True),
+        carrier_frequency=doppler.carrier_frequency,
+        doppler_sigma=np.median(np.broadcast_to(doppler.standard_deviation, doppler.frequency_shift.shape), axis=0),
+        tracker_sigma=np.median(np.broadcast_to(tracker.standard_deviation, (len(tracker.time), 3)), axis=0),
+        epoch_step=max(float(np.median(np.diff(doppler.time))), float(np.median(np.diff(tracker.time)))),
+        look_angles=np.zeros(3) if look_angles is None else np.asarray(look_angles),
+        velocity=np.einsum("nij,nj->ni", axes, velocity).mean(axis=0),
+        prior=np.zeros((3, 3)) if prior is None else prior)
+
+
 def derivative_maps(count: int, duration: float) -> tuple[np.ndarray, np.ndarray]:
-    """Matrices from spline coefficients to those of its first (count - 1, count) and second derivative (count - 2, count).
+    """Matrices from ``count`` spline coefficients to those of its first (count - 1) and second derivative (count - 2).
 
     Every value of a spline lies between the least and the greatest of its coefficients.
     """
@@ -260,7 +316,7 @@ def derivative_maps(count: int, duration: float) -> tuple[np.ndarray, np.ndarray
 
 
 def _sample(request: SessionRequest) -> ca.Function:
-    """``(angles (3) rad, velocity (3) m/s) -> information of one epoch (3 x 3)`` with everything else of the request in it."""
+    """``(angles (3) rad, velocity (3) m/s) -> information of one epoch (3 x 3)``, all else of the request in it."""
     angles, velocity = ca.SX.sym("angles", 3), ca.SX.sym("velocity", 3)
     mounting = ca.DM(request.antenna_from_tracker)
     attitude = rotations.multiply(rotations.conjugate(mounting), antenna_from_orbit(angles + request.look_angles))
@@ -457,8 +513,8 @@ def _starts(request: SessionRequest, count: int, starts: int, seed: int) -> list
 def session_bound(request: SessionRequest, criterion: Criterion, grid: tuple[int, int, int] = (13, 7, 7)) -> float:
     """A criterion that no session within the same angles can go below, whatever its rates.
 
-    The session may share its epochs among all attitudes of the angles' box, in each third of its time as it likes: a convex
-    problem whose value is a bound for every profile. The box is searched on a grid of that many angles per axis,
+    The session may share its epochs among all attitudes of the angles' box, in each third of its time as it likes: a
+    convex problem whose value is a bound for every profile. The box is searched on a grid of that many angles per axis,
     and the tangent plane of the answer on one twice as fine, so the bound is exact but for the grid's step.
     """
     movable = request.limits.movable
