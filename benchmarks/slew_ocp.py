@@ -1,7 +1,7 @@
 """Study of the slew problem: random slews, references, closed forms, replanning, rivals.
 
-Run ``python -m benchmarks.slew_ocp [--count 1000] [--reference 50] [--rivals 20] [--out FILE]``; it prints tables and
-writes JSON. Times are process times of this process and wall times, single-threaded.
+Run ``python -m benchmarks.slew_ocp [--count 1000] [--reference 50] [--rivals 20] [--no-laws] [--out FILE]``; it prints
+tables and writes JSON. Times are process times of this process and wall times, single-threaded.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from estimator.models.errors import InfeasibleError
 from guidance import kinematics as kin
 from guidance.eigenaxis_slew import is_rest_to_rest, s_curve_duration, turn
 from guidance.rodrigues_slew import rodrigues_slew
+from guidance.slew import solve_slew
 from guidance.slew_bounds import lower_bound
 from guidance.slew_envelope import envelope_of
 from guidance.slew_optimum import _solve, _uniform_start, optimal_slew, prepare
@@ -173,6 +174,53 @@ def scan_to_scan_study(count: int) -> dict[str, Any]:
     return {f"shorter_than_mrp{d}": percentiles(v) | {"compared": len(v)} for d, v in ratios.items()}
 
 
+def usage(motion: kin.Motion, of: Limits) -> dict[str, Any]:
+    """Which limit a law comes nearest to, and the share of its samples at 99 % or more of any limit."""
+    used = {"rate": kin.norm(motion.rate) / of.rate, "acceleration": kin.norm(motion.acceleration) / of.acceleration,
+            "jerk": kin.norm(motion.jerk) / of.jerk}
+    return {"binding": max(used, key=lambda name: float(np.max(used[name]))),
+            "share_at_a_limit": float(np.mean(np.max(np.array(list(used.values())), axis=0) > 0.99))}
+
+
+def closed_form_study() -> list[dict[str, Any]]:
+    """Every closed form and the optimum on the same requests, with what tells them apart.
+
+    The share of the time spent at a limit is the number: the quickest slew is at one of its limits all the time. From
+    rest to rest the duration of a polynomial about the eigenaxis also follows by hand from the peaks of its derivatives.
+    """
+    still, z = np.zeros(3), np.array([0.0, 0.0, 1.0])
+    axis = np.array([2.0, -1.0, 2.0]) / 3
+
+    def request(degrees: float, first: float = 0.0, last: float = 0.0, looser: float = 1.0) -> SlewRequest:
+        return SlewRequest(limits(looser), Boundary(np.array([1.0, 0, 0, 0]), first * DEGREE * z, still),
+                           Boundary(kin.exponential(degrees * DEGREE * axis), last * DEGREE * z, still))
+
+    cases = {"rest to rest, 6 deg": request(6), "rest to rest, 30 deg": request(30),
+             "rest to rest, 120 deg": request(120), "rest to rest, 120 deg, jerk x4": request(120, looser=4.0),
+             "forward to reverse scan, 6 deg, 0.06 to -1 deg/s": request(6, 0.06, -1.0),
+             "reverse to forward scan, 12 deg, -1 to 0.06 deg/s": request(12, -1.0, 0.06),
+             "moving ends, 90 deg, 0.6 and -0.6 deg/s": request(90, 0.6, -0.6),
+             "half a turn, 179 deg, 0.3 deg/s": request(179, 0.3, 0.3)}
+    rows = []
+    for name, asked in cases.items():
+        answer = solve_slew(asked)
+        assert answer.optimum is not None
+        grid = np.linspace(0, 1, 4001)[1:-1]
+        row: dict[str, Any] = {"case": name, "optimum_s": answer.duration, "lower_bound_s": answer.lower_bound,
+                               "optimum": usage(answer.motion(grid * answer.duration), asked.limits), "laws": {}}
+        print(f"{name}: optimum {answer.duration:.3f} s, at a limit {row['optimum']['share_at_a_limit']:.0%}")
+        for law_name, law in answer.closed_forms.items():
+            if law is None:
+                continue
+            found = usage(law.motion(grid * law.duration), asked.limits)
+            row["laws"][law_name] = {"duration_s": law.duration, "over_optimum": law.duration / answer.duration - 1,
+                                     **found}
+            print(f"   {law_name:12s} {law.duration:9.3f} s  {law.duration / answer.duration - 1:+8.2%}  binding "
+                  f"{found['binding']:12s} at a limit {found['share_at_a_limit']:.0%}", flush=True)
+        rows.append(row)
+    return rows
+
+
 def rockit_seconds(request: SlewRequest, intervals: int) -> tuple[float, float]:
     """Solve time and duration of the same problem in rockit (multiple shooting, Runge-Kutta, IPOPT, expanded)."""
     import casadi as ca
@@ -323,6 +371,7 @@ def main() -> None:
     parser.add_argument("--reference", type=int, default=50)
     parser.add_argument("--scans", type=int, default=20)
     parser.add_argument("--rivals", type=int, default=10)
+    parser.add_argument("--laws", action=argparse.BooleanOptionalAction, default=True)
     parser.add_argument("--solver", default="ipopt")
     parser.add_argument("--out", type=Path, default=None)
     arguments = parser.parse_args()
@@ -341,8 +390,12 @@ def main() -> None:
     if arguments.rivals:
         result["rivals"] = rival_study(arguments.rivals)
         print(json.dumps(result["rivals"], indent=1), flush=True)
+    if arguments.laws:
+        result["closed_forms"] = closed_form_study()
     if arguments.out:
-        arguments.out.write_text(json.dumps(result, indent=1))
+        if arguments.out.exists():  # studies that were not asked for this time stay
+            result = json.loads(arguments.out.read_text()) | result
+        arguments.out.write_text(json.dumps(result, indent=1) + "\n")
 
 
 if __name__ == "__main__":
