@@ -389,6 +389,24 @@ def test_a_range_below_any_orbit_is_refused(tracking: Tracking) -> None:
         orbit_model(with_value(tracking, "range", lambda v: v * 1e-3), settings())
 
 
+def test_a_single_range_below_the_earths_radius_is_refused(tracking: Tracking) -> None:
+    def change(value: np.ndarray) -> np.ndarray:
+        value[4] = 5.0e6
+        return value
+
+    with pytest.raises(GeometryError, match="below the Earth's radius"):
+        orbit_model(with_value(tracking, "range", change), settings())
+
+
+def test_sums_of_both_legs_taken_for_halves_are_refused(tracking: Tracking) -> None:
+    double = replace(
+        tracking,
+        observations=tuple(replace(o, value=2 * o.value) if o.kind == "range" else o for o in tracking.observations),
+    )
+    with pytest.raises(UnitError, match="half or the sum"):
+        orbit_model(double, settings())
+
+
 def test_two_measurements_are_too_few(tracking: Tracking) -> None:
     two = replace(
         tracking, observations=(tracking.observations[0].subset(np.arange(len(tracking.observations[0].time)) < 2),)

@@ -53,6 +53,9 @@ def state_of_elements(lines: tuple[str, str], epoch: np.datetime64) -> tuple[np.
     import brahe
     import erfa
 
+    if not brahe.get_global_eop_initialization():
+        # Only the true equator frame of SGP4 is used here, which needs no UT1; brahe asks for it all the same.
+        brahe.set_global_eop_provider(brahe.StaticEOPProvider.from_zero())
     try:
         propagator = brahe.SGPPropagator.from_tle(lines[0], lines[1], 60.0)
     except Exception as error:

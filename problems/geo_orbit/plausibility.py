@@ -6,13 +6,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from estimator.models.earth import EQUATORIAL_RADIUS
 from estimator.models.errors import GeometryError, NotFiniteError, UnitError
 from estimator.models.station import east_north_up, station_position
 
 if TYPE_CHECKING:
     from estimator.estimate import Estimate
     from problems.geo_orbit.problem import OrbitModel
+    from problems.geo_orbit.tracking import Observations
 
+FASTEST = 12e3  # m/s, more than any satellite's range changes
+ALLOWANCE = 200e3  # m
 LOWEST_RANGE = 100e3  # m, an orbit's height at the least
 HIGHEST_RANGE = 1e9  # m, beyond the Moon
 _BELOW = np.radians(-5.0)  # rad, elevation that no refraction explains
@@ -58,6 +62,7 @@ def check_observations(model: OrbitModel) -> None:
                     limit=f"{HIGHEST_RANGE:.3g} m",
                     remedy="check the unit of the file",
                 )
+            _check_jumps(model, o, one_way)
         if o.kind == "azimuth_elevation":
             off = np.abs(o.value[:, 1]) > np.pi / 2 + 1e-9
             wide = np.abs(o.value[:, 0]) > 2 * np.pi + 1e-9
@@ -73,6 +78,26 @@ def check_observations(model: OrbitModel) -> None:
         if o.kind == "direction_cosines" and (np.sum(o.value**2, axis=1) > 1.02).any():
             raise UnitError("direction cosines exceed unit length", where=place)
     _check_ranges_together(model)
+
+
+def _check_jumps(model: OrbitModel, o: Observations, one_way: np.ndarray) -> None:
+    """A range below the Earth's radius that no motion leads to from the measurement before or after it.
+
+    Such ranges are real for a satellite near its perigee, so the length alone proves nothing.
+    """
+    time = model.seconds(o.time)
+    where = np.flatnonzero(one_way < EQUATORIAL_RADIUS)
+    for row in where:
+        beside = [i for i in (row - 1, row + 1) if 0 <= i < len(time)]
+        reach = [abs(one_way[i] - one_way[row]) - FASTEST * abs(time[i] - time[row]) for i in beside]
+        if reach and min(reach) > ALLOWANCE:
+            raise GeometryError(
+                "a range is below the Earth's radius and out of reach of the measurements before and after it",
+                where=f"{o.source or 'data'}: {o.name}" + ("" if o.line is None else f", line {int(o.line[row])}"),
+                value=f"{one_way[row] / 1e3:.3f} km one way",
+                limit=f"about {one_way[beside[0]] / 1e3:.1f} km as its neighbour",
+                remedy="correct or remove this measurement",
+            )
 
 
 def _check_ranges_together(model: OrbitModel) -> None:
@@ -170,12 +195,38 @@ def _stumpff(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return c2, c3
 
 
+def _check_legs(model: OrbitModel) -> None:
+    """Ranges that are about twice, half, or otherwise far from those of the starting orbit."""
+    legs = 2.0 if model.settings.legs == "sum" else 1.0
+    ratios: list[np.ndarray] = []
+    for o in model.tracking.observations:
+        if o.kind != "range" or o.receiver != o.transmitter:
+            continue
+        time = model.seconds(o.time)
+        fixed = model.environment.earth_fixed_state(time, kepler(model.position, model.velocity, time))[:, :3]
+        station = model.station(o.receiver)
+        line = fixed - station_position(station.latitude, station.longitude, station.altitude)
+        ratios.append(o.value[:, 0] / legs / np.linalg.norm(line, axis=1))
+    if not ratios:
+        return
+    ratio = float(np.median(np.concatenate(ratios)))
+    if not 0.6 < ratio < 1.6:
+        raise UnitError(
+            "the ranges do not fit the initial orbit: their length over that of the orbit's is far from one",
+            value=f"median ratio {ratio:.4g}",
+            limit="0.6 to 1.6",
+            remedy="check whether ranges are half or the sum of both legs (measurements.range), their unit, and the "
+            "initial orbit",
+        )
+
+
 def check_start(model: OrbitModel) -> None:
     """Compare the data with the initial orbit that the user gave.
 
     Raises:
         GeometryError: a station never sees the satellite of that orbit, while it reports measurements.
     """
+    _check_legs(model)
     for name, (_, elevation) in predicted_elevations(model).items():
         station = name.split("/")[0]
         if len(elevation) and np.mean(elevation < _BELOW) > 0.5:

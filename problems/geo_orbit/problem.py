@@ -210,7 +210,7 @@ def orbit_model(tracking: Tracking, settings: OrbitSettings, *, loss: Loss | Non
         velocity=start[1],
         velocity_steps=tuple(sorted(bare.seconds_of_text(t) for t in settings.manoeuvre_times)),
     )
-    if settings.position is not None:
+    if settings.position is not None or settings.tle is not None:
         check_start(model)
     return model
 

@@ -151,7 +151,9 @@ def _within(tracking: Tracking, measurements: Mapping[str, Any]) -> Tracking:
     kept = [o.subset((o.time >= low) & (o.time <= high)) for o in tracking.observations]
     kept = [o for o in kept if len(o.time)]
     if not kept:
-        raise RequestError("no measurement lies between start and stop", where="[measurements]", value=f"{first} to {last}")
+        raise RequestError(
+            "no measurement lies between start and stop", where="[measurements]", value=f"{first} to {last}"
+        )
     return replace(tracking, observations=tuple(kept))
 
 
