@@ -38,6 +38,7 @@ from benchmarks.sentinel1_geometry import DATA, HERE, acquisitions
 from estimator.models.files import written_atomically
 from estimator.residuals import KernelResidual
 from estimator.solvers import solve
+from problems.alignment.investigation import explain_campaign
 from problems.alignment.problem import AlignmentModel, alignment_model, alignment_problem
 from problems.alignment.sentinel1_import import SPEED_OF_LIGHT, campaign_with_swaths
 from problems.readers.sentinel1_annotation import Annotation, read_annotation
@@ -349,10 +350,10 @@ squints are those of [the page on Sentinel-1](sentinel1.md).
 
 Every model is fitted on one part of the Doppler estimates and held against another that it never saw. An addition to
 the model is proposed by the fitted part alone: the fall of chi-square, scaled by the misfit before it and by
-{together:g} because the three values of an estimate err together, must have a probability below {chance:g} by chance. It
-is accepted if the held-out part falls as well. Numbers are root mean squares in Hz of measured minus modelled; 10 Hz are 2.1
-millidegrees of squint. *Floor* is the white part of the scatter of single values, from differences of successive
-estimates of a sub-swath; *annotated* is the RMS of the radar data about each estimate, as the product says it.
+{together:g} because the three values of an estimate err together, must have a probability below {chance:g} by chance.
+It is accepted if the held-out part falls as well. Numbers are root mean squares in Hz of measured minus modelled;
+10 Hz are 2.1 millidegrees of squint. *Floor* is the white part of the scatter of single values, from differences of
+successive estimates of a sub-swath; *annotated* is the RMS of the radar data about each estimate, as the product says it.
 
 ## In one paragraph
 
@@ -377,6 +378,16 @@ one. The additions under *accepted* passed both tests.
 {together_table}
 
 {steps}
+
+## What `boresight explain` says
+
+The workflow as it is for any campaign, with its own test, search and proof (it holds out the last fifth of each arc, in
+whitened units, and takes errors of successive estimates for independent):
+
+{workflow}
+
+A name that holds for one scene alone, and neither for its neighbours nor for all together, stands for the drift along
+that scene and not for physics.
 
 ## What remains
 
@@ -448,6 +459,13 @@ def _steps(together: dict[str, Any]) -> str:
     return "Proposals in their order, with the held-out part before and after:\n\n" + "\n".join(lines)
 
 
+def _workflow_table(result: dict[str, Any]) -> str:
+    lines = [_cells("scene", "verdict", "why"), "|---|---|---|"]
+    for name, found in result["workflow"].items():
+        lines.append(_cells(name, found["verdict"], found["why"].replace("|", "/")))
+    return "\n".join(lines)
+
+
 def _structure_table(scenes: dict[str, Any]) -> str:
     lines = [_cells("scene", "RMS left", "along track", "along range", "drift", "time scale, s", "sub-swaths"),
              "|---|---|---|---|---|---|---|"]
@@ -497,6 +515,14 @@ def verdict(result: dict[str, Any]) -> str:
     after = np.sqrt(np.mean([t["held_out_after_hz"] ** 2 for t in tracks]))
     scales = [s["structure"]["time_scale_s"] for s in scenes.values()]
 
+    alike = [c for s in scenes.values() if (c := s["structure"]["correlation_between_sub_swaths"]) is not None]
+    agree = sum(1 for c in alike if c > 0.5)
+
+    phase = ("antenna-thermal-deformation", "tracker-low-frequency-error")
+    periodic = ("(a function of the orbit's phase is proposed as well)"
+                if any(p["single_effects"][n]["proposed"] for p in together["splits"].values() for n in phase)
+                else "(no function of the orbit's phase is proposed in its place)")
+
     def said(part: dict[str, Any]) -> str:
         return ", ".join(["mounting"] * part["mounting_accepted"] + part["accepted"]) or "nothing"
 
@@ -507,18 +533,20 @@ def verdict(result: dict[str, Any]) -> str:
         f"{pooled['third sub-swath']:.2f} times. Inside single scenes a further named effect is accepted in {added}",
         f"of {len(counted)}. Over all scenes of Sentinel-1A together the accepted model is, for the second half,",
         f"{said(half)} ({half['geometry']['held_out_hz']:.1f} Hz with geometry alone,",
-        f"{half['mounting']['held_out_hz']:.1f} with one mounting, {half['final']['held_out_hz']:.1f} at the end, floor",
-        f"{half['floor_hz']:.1f}), and for IW3 {said(third)} ({third['geometry']['held_out_hz']:.1f},",
+        f"{half['mounting']['held_out_hz']:.1f} with one mounting, {half['final']['held_out_hz']:.1f} at the end,",
+        f"floor {half['floor_hz']:.1f}), and for IW3 {said(third)} ({third['geometry']['held_out_hz']:.1f},",
         f"{third['mounting']['held_out_hz']:.1f}, {third['final']['held_out_hz']:.1f}, floor {third['floor_hz']:.1f}):",
-        "the pointing differs from one acquisition to the next, which in one scene is the same as a mounting, and no",
-        "function of the orbit's phase stands in for it. What is left above the floor has no name in the library:",
-        "`unknown`, in the Doppler channel, in most acquisitions. Its shape: it varies along track with a time scale of",
-        f"{np.nanmin(scales):.0f} to {np.nanmax(scales):.0f} s (median {np.nanmedian(scales):.0f} s). In the scenes where",
-        "the sub-swaths agree (correlation above 0.5) it is a motion of the beam, or an error of the attitude, faster than",
-        "the attitude samples follow; where they do not, it belongs to what is imaged. The common course of IW1 and IW2",
-        f"taken off IW3 lowers it in {lower} of {len(tracks)} scenes ({before:.1f} to {after:.1f} Hz over all); the mean",
-        f"pattern of other scenes along range lowers a scene in {fewer} of {len(patterns)}: there is no fixed pattern",
-        "along range beyond the turn of the mounting.",
+        "the pointing differs from one acquisition to the next, which in one scene is the same as a mounting",
+        f"{periodic}. What is left above the floor has no name in the library:",
+        "`unknown`, in the Doppler channel, in most acquisitions. Its shape: it varies along track with a time scale",
+        f"of {np.nanmin(scales):.0f} to {np.nanmax(scales):.0f} s (median {np.nanmedian(scales):.0f} s). Where the",
+        f"sub-swaths see the same course (correlation above 0.5, {agree} of {len(alike)} scenes) it is common to all",
+        "ranges, as a motion of the beam or an error of the annotated attitude would be; elsewhere it differs from",
+        "sub-swath to sub-swath, as what depends on the imaged ground would. The common course of IW1 and IW2",
+        f"taken off IW3 lowers it in {lower} of {len(tracks)} scenes ({before:.1f} to {after:.1f} Hz over all); the",
+        f"mean pattern of other scenes along range lowers a scene in {fewer} of {len(patterns)}"
+        + (": there is no fixed pattern along range beyond the turn of the mounting." if 2 * fewer <= len(patterns)
+           else "."),
     ]
     return "\n".join(textwrap.wrap(" ".join(texts), 118))
 
@@ -529,7 +557,8 @@ def page(result: dict[str, Any]) -> str:
     return PAGE_TEXT.format(
         chance=CHANCE, together=TOGETHER, verdict=verdict(result), second_half=_scene_table(scenes, "second half"),
         third=_scene_table(scenes, "third sub-swath"), together_table=_together_table(result["together"]),
-        steps=_steps(result["together"]), structure=_structure_table(scenes), empirical=_empirical_table(scenes))
+        steps=_steps(result["together"]), workflow=_workflow_table(result),
+        structure=_structure_table(scenes), empirical=_empirical_table(scenes))
 
 
 def measured(annotations: list[Annotation]) -> dict[str, Any]:
@@ -552,7 +581,11 @@ def measured(annotations: list[Annotation]) -> dict[str, Any]:
     largest = max({a.mission for a in annotations}, key=lambda m: sum(a.mission == m for a in annotations))
     together = Case(f"all scenes of {largest}", [a for a in annotations if a.mission == largest])
     print(f"{together.name} ({clock.perf_counter() - began:.0f} s)", file=sys.stderr)
-    return {"scenes": scenes,
+    workflow = {}
+    for case in (*cases, together):
+        findings = explain_campaign(campaign_with_swaths(case.annotations)[0])
+        workflow[case.name] = {"verdict": findings.verdict, "why": findings.why}
+    return {"scenes": scenes, "workflow": workflow,
             "together": {"name": together.name, "splits": {s: explained(together, s) for s in SPLITS},
                          "structure": structure(together), "along_track_term": along_track_term(together)},
             "seconds": clock.perf_counter() - began}

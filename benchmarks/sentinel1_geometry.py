@@ -56,8 +56,8 @@ independent. They are not: the *drift*, mean residual of the second half of a sc
 in several scenes, because the pointing really changes along an acquisition and because the measured Doppler depends on
 what is imaged. *Scatter* is the standard deviation that the residuals themselves give when they may be correlated over
 a third of a scene (over all scenes: when only whole acquisitions count as independent). The larger of the two is the
-honest one; the differences between scenes, {spread:.1f} millidegrees, are larger still, so that a mounting is not what one scene
-measures ([what it may be](sentinel1_explain.md)). *Yaw* is the turn about the other determined axis, nearly the antenna
+honest one. The differences between scenes, {spread:.1f} millidegrees, are larger still, so that one scene does not
+measure a mounting ([what it may be](sentinel1_explain.md)). *Yaw* is the turn about the other determined axis, nearly the antenna
 normal, seen from the slope along range, with its scatter. The status says where a constant mounting leaves the data
 unexplained (`model_gap`); `unobservable` says that the turn about the velocity is not determined.
 
