@@ -353,7 +353,7 @@ the model is proposed by the fitted part alone: the fall of chi-square, scaled b
 {together:g} because the three values of an estimate err together, must have a probability below {chance:g} by chance.
 It is accepted if the held-out part falls as well. Numbers are root mean squares in Hz of measured minus modelled;
 10 Hz are 2.1 millidegrees of squint. *Floor* is the white part of the scatter of single values, from differences of
-successive estimates of a sub-swath; *annotated* is the RMS of the radar data about each estimate, as the product says it.
+successive estimates of a sub-swath; *annotated* is the RMS of the radar data about each estimate, as the product says.
 
 ## In one paragraph
 
