@@ -187,7 +187,8 @@ def best_shares(candidates: np.ndarray, criterion: Criterion, prior: np.ndarray 
     """The shares of the candidates that make the criterion least, and the bound that proves it.
 
     Minimises the criterion of ``prior + sum_bk w_bk candidates_bk`` under ``w >= 0`` and ``sum_k w_bk = 1/b`` by the
-    multiplicative algorithm (Silvey, Titterington and Torsney 1978). The bound is the tangent plane at the answer, below the criterion everywhere since the criterion is convex.
+    multiplicative algorithm (Silvey, Titterington and Torsney 1978). The bound is the tangent plane at the answer, below
+    the criterion everywhere since the criterion is convex.
 
     Args:
         candidates: (b, k, n, n) or (k, n, n) information of each candidate if it had the whole time; blocks hold
@@ -217,17 +218,25 @@ def best_shares(candidates: np.ndarray, criterion: Criterion, prior: np.ndarray 
     if not np.isfinite(criterion_value("D", matrix)):
         raise RequestError("the candidates together leave a direction undetermined", where="candidates",
                            remedy="allow more motion, or give what is known already")
-    bound = -np.inf
+    bound, power = -np.inf, 0.5
+    value, slope = _value_and_slope(criterion, matrix, wanted)
     for _ in range(iterations):
-        matrix = known + np.einsum("bk,bkm->m", weights, flat).reshape(size, size)
-        value, slope = _value_and_slope(criterion, matrix, wanted)
         gain = flat @ slope.ravel()
         lowest = value + float(np.sum(slope * (matrix - known))) - float(np.mean(gain.max(axis=1)))
         bound = max(bound, lowest)
         if value - bound <= tolerance * (len(wanted) if criterion == "D" else abs(value)):
             break
-        grown = weights * np.sqrt(np.maximum(gain, 0.0))
-        weights = grown / (blocks * grown.sum(axis=1, keepdims=True))
+        # A small enough power always improves (Yu 2010); a larger one, while it does, is faster.
+        while True:
+            grown = weights * (np.maximum(gain, 0.0) / gain.max(axis=1, keepdims=True)) ** power
+            trial = grown / (blocks * grown.sum(axis=1, keepdims=True))
+            trial_matrix = known + np.einsum("bk,bkm->m", trial, flat).reshape(size, size)
+            trial_value, trial_slope = _value_and_slope(criterion, trial_matrix, wanted)
+            if trial_value <= value or power < 1 / (2 * EXPONENT):
+                break
+            power /= 2
+        weights, matrix, value, slope = trial, trial_matrix, trial_value, trial_slope
+        power = min(1.2 * power, 4.0)
     exact = criterion_value(criterion, information_about(wanted, matrix))
     if criterion == "E":
         bound = certified_bound("E", matrix, stack, known, wanted)
