@@ -70,6 +70,7 @@ class OrbitEffect:
         correction: field of :class:`estimator.models.ranging.Corrections`, of a measurement.
         kinds: kinds of measurement that it changes.
         station: the station it belongs to; "" for all.
+        each: stations that have one parameter each, in the order of the parameters; empty where all share them.
         zero: the condition under which it vanishes.
         reference: where the formula comes from.
     """
@@ -84,6 +85,7 @@ class OrbitEffect:
     station: str = ""
     zero: str = ""
     reference: str = ""
+    each: tuple[str, ...] = ()
 
 
 _ALL = ("range", "range_rate", "azimuth_elevation", "direction_cosines")
@@ -277,6 +279,22 @@ def instances(layout: OrbitLayout) -> tuple[OrbitEffect, ...]:
                 for name in present
                 if name not in taken
             ]
+    ranging = tuple(name for name, has in layout.stations if "range" in has and "range" not in biased.get(name, ()))
+    if len(ranging) > 1:
+        found.append(
+            OrbitEffect(
+                "range-bias:each",
+                "range-bias",
+                "measurement",
+                tuple(Parameter(name, "m", 100.0, (-1e5, 1e5)) for name in ranging),
+                None,
+                "range_bias",
+                ("range",),
+                each=ranging,
+                zero="all biases = 0",
+                reference="delay of equipment, another one at every station",
+            )
+        )
     if not layout.light_time:
         found.append(
             OrbitEffect(

@@ -52,9 +52,8 @@ class OrbitSubject:
         return self.effects  # type: ignore[return-value]
 
     def problem(self, effects: Sequence[str], candidates: Sequence[str], *, hold_out: bool) -> Problem:
-        """See :class:`estimator.discrepancy.subject.Subject`; every effect is in the kernels, so they compile once."""
-        del candidates
-        problem = orbit_problem(self.model, effects, candidates=[e.name for e in self.effects])
+        """See :class:`estimator.discrepancy.subject.Subject`."""
+        problem = orbit_problem(self.model, effects, candidates=candidates)
         if not hold_out:
             return problem
         residuals = []

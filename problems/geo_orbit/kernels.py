@@ -28,6 +28,8 @@ class Correcting:
 
     unknown: Unknown
     field: str
+    component: int | None = None
+    """Which number of the unknown it is; None for all of them."""
 
 
 _DATA: tuple[tuple[str, int | tuple[int, int]], ...] = (
@@ -61,7 +63,7 @@ def measurement_kernel(kind: Kind, signalling: Signalling, same: bool, correctin
     def build(seen: dict[str, ca.SX]) -> ca.SX:
         corrections = Corrections()
         for c in correcting:
-            value = seen[c.unknown.name]
+            value = seen[c.unknown.name] if c.component is None else seen[c.unknown.name][c.component]
             before = getattr(corrections, c.field)
             setattr(corrections, c.field, value if before is None else before + value)
         earth = Earth(seen["intermediate"], seen["angle"], seen["pole"])

@@ -389,7 +389,10 @@ def _residual(
         measured = measured - bias
     for e in effects:
         if e.channel == "measurement" and o.kind in e.kinds and e.station in ("", o.receiver):
-            correcting.append(Correcting(need(effect_unknown(e), effect_start(e)), e.correction))
+            if e.each and o.receiver not in e.each:
+                continue
+            component = e.each.index(o.receiver) if e.each else None
+            correcting.append(Correcting(need(effect_unknown(e), effect_start(e)), e.correction, component))
     kernel = measurement_kernel(o.kind, signalling, same, correcting)
     sigma = np.array([receiver.sigma.get(c, s.sigma[c]) for c in components])
     data = {"measured": measured, **measurement_data(model.environment, time, transmitter, receiver)}
