@@ -37,7 +37,9 @@ def measured(folder: Path, repeat: int) -> dict[str, Any]:
         "position_m": float(np.linalg.norm(solution.position - PUBLISHED[:3])),
         "velocity_m_s": float(np.linalg.norm(solution.velocity - PUBLISHED[3:])),
         "acceleration_relative": acceleration / ACCELERATION - 1,
-        **{f"{c}_standard_deviation": rows[f"all/{c}"]["standard_deviation"] for c in ("range", "azimuth", "elevation")},
+        "range_m": rows["all/range"]["standard_deviation"],
+        "azimuth_deg": rows["all/azimuth"]["standard_deviation"],
+        "elevation_deg": rows["all/elevation"]["standard_deviation"],
     }
 
 

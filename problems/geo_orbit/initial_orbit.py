@@ -7,7 +7,7 @@ squares over a horizon that grows from a part of a revolution to all data.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -64,9 +64,8 @@ def state_of_elements(lines: tuple[str, str], epoch: np.datetime64) -> tuple[np.
     date, clock = text.split("T")
     year, month, day = (int(w) for w in date.split("-"))
     hour, minute, second = clock.split(":")
-    instant = brahe.Epoch.from_datetime(
-        year, month, day, int(hour), int(minute), float(second), 0.0, brahe.TimeSystem.TAI
-    )  # type: ignore[arg-type]
+    scale: Any = brahe.TimeSystem.TAI  # the stubs give the members as methods
+    instant = brahe.Epoch.from_datetime(year, month, day, int(hour), int(minute), float(second), 0.0, scale)
     teme = np.asarray(propagator.state(instant))
     days = float((epoch - np.datetime64("2000-01-01T12:00:00", "us")) / np.timedelta64(1, "us")) / 86400e6
     tt = days + 32.184 / 86400  # day

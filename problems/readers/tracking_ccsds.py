@@ -18,6 +18,7 @@ import numpy as np
 from estimator.models.earth_orientation import tai_from_utc, utc_text
 from estimator.models.errors import FileFormatError, RequestError, TimeOrderError
 from estimator.models.files import written_atomically
+from estimator.models.ranging import Kind
 from problems.geo_orbit.tracking import Observations, Tracking
 
 _DEGREE = np.pi / 180  # [rad]
@@ -101,7 +102,7 @@ def _blocks(path: Path, version: str) -> tuple[dict[str, str], list[_Block]]:
     return header, blocks
 
 
-_KINDS = {"RANGE": "range", "DOPPLER_INSTANTANEOUS": "range_rate", "DOPPLER_INTEGRATED": "range_rate"}
+_KINDS: dict[str, Kind] = {"RANGE": "range", "DOPPLER_INSTANTANEOUS": "range_rate", "DOPPLER_INTEGRATED": "range_rate"}
 
 
 def read_tdm(path: Path) -> Tracking:
@@ -178,7 +179,7 @@ def read_tdm(path: Path) -> Tracking:
                     kind,
                     receiver,
                     transmitter,
-                    time[order],  # type: ignore[arg-type]
+                    time[order],
                     factor * np.array([[r[1]] for r in rows])[order],
                     path.name,
                     np.array([r[2] for r in rows])[order],
