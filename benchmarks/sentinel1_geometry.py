@@ -58,8 +58,8 @@ what is imaged. *Scatter* is the standard deviation that the residuals themselve
 a third of a scene (over all scenes: when only whole acquisitions count as independent). The larger of the two is the
 honest one. The differences between scenes, {spread:.1f} millidegrees, are larger still, so that one scene does not
 measure a mounting ([what it may be](sentinel1_explain.md)). *Yaw* is the turn about the other determined axis, nearly
-the antenna normal, seen from the slope along range, with its scatter. The status says where a constant mounting leaves the data
-unexplained (`model_gap`); `unobservable` says that the turn about the velocity is not determined.
+the antenna normal, seen from the slope along range, with its scatter. The status says where a constant mounting leaves
+the data unexplained (`model_gap`); `unobservable` says that the turn about the velocity is not determined.
 
 ## Geometry Doppler, ours minus annotated
 
