@@ -42,6 +42,7 @@ _NEARER = 0.004  # and this near where the ends accelerate
 _FINE = 40  # intervals of a refined mesh
 _REFINEMENTS = 3  # at most
 _SETTLED = 1e-3  # relative gain of a refinement below which there is no other
+_FINER, _SETTLED_FINER = 60, 3e-4  # the same where the ends accelerate
 _LAST_PIECE = 1e-3  # of the time to build up the acceleration: length of the piece with the jerk asked for at the stop
 
 
@@ -334,11 +335,13 @@ def _one_way(request: SlewRequest, limits: Limits, envelope: Envelope, long_way:
                 speed, durations=np.maximum(speed.durations, duration / 7)), mesh)
             attempt("from a slower start", mesh, sigma, rate, acceleration, duration)
     if best is not None and best.success:
+        # Accelerated ends have more switches, at places that are not known beforehand.
+        count, settled = (_FINER, _SETTLED_FINER) if pushed > 0.02 else (_FINE, _SETTLED)
         for _ in range(_REFINEMENTS):
             before = best.duration
-            fractions, sigma, rate, acceleration = _refined(best, limits, _FINE)
+            fractions, sigma, rate, acceleration = _refined(best, limits, count)
             attempt("on a refined mesh", fractions, sigma, rate, acceleration, best.duration, options=quick)
-            if best.duration > before * (1 - _SETTLED):
+            if best.duration > before * (1 - settled):
                 break
     return best, spent
 
