@@ -213,7 +213,7 @@ def _serial_cells(residual: object, part: Linearization, scale: float) -> list[_
     cells = []
     for component in range(series.shape[1]):
         x = series[:, component]
-        spread = float(np.mean(x**2))
+        spread = max(float(np.mean(x**2)), 1.0)  # what stays below the declared noise is no gap, however smooth
         product = float(np.sum(x[1:][pairs] * x[:-1][pairs]))
         z = product / (np.sqrt(count) * spread)
         cells.append(_Cell(residual.channel, label, component, count, float(time[0]), float(time[-1]), z * z, 1,
