@@ -186,7 +186,7 @@ def closed_form_study() -> list[dict[str, Any]]:
     """Every closed form and the optimum on the same requests, with what tells them apart.
 
     The share of the time spent at a limit is the number: the quickest slew is at one of its limits all the time. From
-    rest to rest the duration of a polynomial about the eigenaxis also follows by hand from the peaks of its derivatives.
+    rest to rest the duration of a polynomial about the eigenaxis also follows from the peaks of its derivatives.
     """
     still, z = np.zeros(3), np.array([0.0, 0.0, 1.0])
     axis = np.array([2.0, -1.0, 2.0]) / 3
