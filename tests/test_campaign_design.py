@@ -222,17 +222,16 @@ def test_simulated_attitude_follows_the_profile_and_its_rate(base):
 def test_predicted_covariance_is_that_of_the_joint_estimate(base):
     """The bound of the design against the covariance of a simulated campaign that is solved; the orbit differs."""
     scenario, request, found = base
-    for profile, angles in ((found.coefficients, found.profile(request.epochs)[0]),):
-        flown = replace(scenario, slew_profile=tuple(map(tuple, profile.tolist())))
-        campaign, truth = simulate(flown, 11)
-        solution = solve_campaign(campaign)
-        covariance = solution.estimate.covariance_of("antenna_from_tracker")
-        predicted = np.linalg.inv(session.session_information(request, angles))
-        assert np.sqrt(np.diag(covariance)) == pytest.approx(np.sqrt(np.diag(predicted)), rel=0.15)
-        error = Rotation.from_quat(solution.antenna_from_tracker, scalar_first=True) * Rotation.from_quat(
-            truth.antenna_from_tracker, scalar_first=True).inv()
-        squared = error.as_rotvec() @ np.linalg.solve(covariance, error.as_rotvec())
-        assert squared < 30  # chi-square of 3 degrees: one in a million
+    flown = replace(scenario, slew_profile=tuple(map(tuple, found.coefficients.tolist())))
+    campaign, truth = simulate(flown, 11)
+    solution = solve_campaign(campaign)
+    covariance = solution.estimate.covariance_of("antenna_from_tracker")
+    predicted = np.linalg.inv(session.session_information(request, found.profile(request.epochs)[0]))
+    assert np.sqrt(np.diag(covariance)) == pytest.approx(np.sqrt(np.diag(predicted)), rel=0.15)
+    error = Rotation.from_quat(solution.antenna_from_tracker, scalar_first=True) * Rotation.from_quat(
+        truth.antenna_from_tracker, scalar_first=True).inv()
+    squared = error.as_rotvec() @ np.linalg.solve(covariance, error.as_rotvec())
+    assert squared < 30  # chi-square of 3 degrees: one in a million
 
 
 def test_information_of_the_flown_attitude_is_that_of_the_joint_problem(base):
@@ -485,8 +484,7 @@ def test_the_command_answers_in_json(tmp_path):
     told = found["session"]
     assert told["no_session_below"] <= told["value"] < told["reference_rms_rad"] ** 2
     assert len(told["profile"]["time_s"]) == 301
-    assert np.abs(told["profile"]["angles_rad"]).max(axis=0) == pytest.approx(np.minimum(
-        np.abs(told["profile"]["angles_rad"]).max(axis=0), np.radians([20, 8, 8]) * (1 + 1e-9)))
+    assert np.all(np.abs(told["profile"]["angles_rad"]).max(axis=0) <= np.radians([20, 8, 8]) * (1 + 1e-9))
     assert json.loads(out.read_text())["session"]["minutes"] == 5
     # The answer's scenario goes to the simulator as it is.
     preset("base", slew_profile=tuple(map(tuple, told["scenario"]["slew_profile"])))

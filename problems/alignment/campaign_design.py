@@ -45,7 +45,7 @@ def checked_criterion(name: str) -> Criterion:
     """
     for known in get_args(Criterion):
         if name.upper() == known:
-            return known  # type: ignore[no-any-return]
+            return known
     raise RequestError(f"no criterion is named {name!r}", where="criterion", limit="A, D or E",
                        remedy="; ".join(f"{k}: {v}" for k, v in MEANING.items()))
 
@@ -187,8 +187,8 @@ def best_shares(candidates: np.ndarray, criterion: Criterion, prior: np.ndarray 
     """The shares of the candidates that make the criterion least, and the bound that proves it.
 
     Minimises the criterion of ``prior + sum_bk w_bk candidates_bk`` under ``w >= 0`` and ``sum_k w_bk = 1/b`` by the
-    multiplicative algorithm (Silvey, Titterington and Torsney 1978). The bound is the tangent plane at the answer, below
-    the criterion everywhere since the criterion is convex.
+    multiplicative algorithm (Silvey, Titterington and Torsney 1978). The bound is the tangent plane at the answer,
+    below the criterion everywhere since the criterion is convex.
 
     Args:
         candidates: (b, k, n, n) or (k, n, n) information of each candidate if it had the whole time; blocks hold

@@ -102,8 +102,8 @@ class RotationRequest:
         if self.free_arcs < 0 or self.pulse_arcs < 1 or not self.pulse_shapes:
             raise RequestError("actuator axes need a pulse", where="free_arcs, pulse_arcs, pulse_shapes",
                                value=(self.free_arcs, self.pulse_arcs, len(self.pulse_shapes)), limit="0, 1 and 1")
-        for shape in self.pulse_shapes:
-            for start, stop, share in shape:
+        for segments in self.pulse_shapes:
+            for start, stop, share in segments:
                 if not (0 <= start < stop <= self.pulse_duration and abs(share) <= 1):
                     raise RequestError("a torque segment is outside of its arc or above the limit",
                                        where="pulse_shapes", value=(start, stop, share),
