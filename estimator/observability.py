@@ -18,8 +18,8 @@ from estimator.unknowns import UnitQuaternion, Unknown, offsets
 UNDETERMINED = 1.001
 """Posterior over prior sigma above which a direction counts as not determined.
 
-A little above one: where a prior enters the cost, a direction that the data leave alone has a ratio of exactly one, and is
-determined by that prior; rounding must not decide."""
+A little above one: where a prior enters the cost, a direction that the data leave alone has a ratio of exactly one, and
+is determined by that prior; rounding must not decide."""
 
 
 @dataclass(frozen=True)

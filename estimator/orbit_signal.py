@@ -1,7 +1,7 @@
 """An orbit as a signal of the engine: the state at the times of the samples, with derivatives along the unknowns.
 
-An :class:`OrbitArc` holds the equations of motion, the unknowns that they depend on (position and velocity at the epoch,
-force parameters, velocity steps) and propagates once for all signals that ask at the same values.
+An :class:`OrbitArc` holds the equations of motion, the unknowns that they depend on (position and velocity at the
+epoch, force parameters, velocity steps) and propagates once for all signals that ask at the same values.
 """
 
 from __future__ import annotations

@@ -144,7 +144,7 @@ class NormalEquations:
 
 
 def weighted_rows(part: Linearization, pick: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Jacobian (n m, columns ``pick``) and whitened residual (n m) of a residual, weighted; copied only where needed."""
+    """Jacobian (n m, columns ``pick``) and whitened residual (n m) of a residual, weighted; copied where needed."""
     n, m, p = part.jacobian.shape
     rows = part.jacobian if np.array_equal(pick, np.arange(p)) else part.jacobian[:, :, pick]
     right = part.whitened

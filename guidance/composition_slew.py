@@ -2,8 +2,8 @@
 
 ``Lam(t) = Lam_i o exp(p1(t)) o exp(phi(t) e3) o exp(p2(t))``: p1 carries the rate and the acceleration of the start and
 dies out, phi turns about the eigenaxis e3 of the whole turn, p2 grows into the rate, the acceleration and the jerk of
-the stop. At p = 0 the motion of exp(p) is ``w = p'``, ``eps = p''``, ``eps' = p''' - p' x p'' / 2``, which gives the third
-derivatives at the ends.
+the stop. At p = 0 the motion of exp(p) is ``w = p'``, ``eps = p''``, ``eps' = p''' - p' x p'' / 2``, which gives the
+third derivatives at the ends.
 
 Source: Somov, Butyrin, Makarov, section 1, condition (2), "necessary and sufficient condition of solvability of the
 Darboux problem"; the paper prints no formula. The product is the publicly known form with scalar angles about fixed

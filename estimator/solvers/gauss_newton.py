@@ -83,7 +83,8 @@ def solve(problem: Problem, options: Options | None = None) -> Estimate:
 
 
 def _minimize(problem: Problem, values: Mapping[str, np.ndarray], parts: list[Linearization],
-              equations: NormalEquations, options: Options, done: int) -> tuple[Mapping[str, np.ndarray], list[Linearization], int, str]:
+              equations: NormalEquations, options: Options, done: int,
+              ) -> tuple[Mapping[str, np.ndarray], list[Linearization], int, str]:
     """Damped Gauss-Newton steps with frozen whitening until the step is small; returns the reason if it gives up."""
     damping, growth, used = options.damping, 4.0, 0
     scales = np.concatenate([np.zeros(0), *(u.scales for u in problem.free)])
