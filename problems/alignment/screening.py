@@ -17,7 +17,8 @@ from problems.alignment.campaign import Campaign
 
 THRESHOLD = 7.0  # standard deviations
 SAMPLES_PER_KNOT = 8
-FEWEST = 40  # samples of a stretch that can be screened
+FEWEST = 40  # samples of a stretch that can be screened without a model
+NEIGHBOURS = 7  # samples of a running median of residuals
 LONGEST_GAP_STEPS = 3.5
 DEGREE = 5
 
@@ -119,3 +120,28 @@ def screen(campaign: Campaign) -> Screening:
         keep_doppler = ~smooth_outliers(doppler.time, doppler.frequency_shift,
                                         np.broadcast_to(doppler.standard_deviation, shape))
     return Screening(keep_gnss, keep_doppler, keep_tracker)
+
+
+def isolated_outliers(whitened: np.ndarray, series: np.ndarray) -> np.ndarray:
+    """Mask (n,) of the samples whose residual stands apart from those of their neighbours.
+
+    What a model misses is smooth in time and is followed by the running median that is taken off; a sample counts only
+    if it is further from that than ``THRESHOLD`` standard deviations, or robust spreads of its arc if these are larger.
+    So short stretches, which :func:`screen` must leave alone, are screened with the help of a fitted model.
+
+    Args:
+        whitened: (n, m) whitened residuals in order of time.
+        series: (n,) index of the arc of each sample.
+    """
+    outlier = np.zeros(len(whitened), dtype=bool)
+    for label in np.unique(series):
+        inside = np.flatnonzero(series == label)
+        rows = whitened[inside]
+        if len(rows) < NEIGHBOURS:
+            continue
+        half = NEIGHBOURS // 2
+        windows = np.clip(np.arange(len(rows)) - half, 0, len(rows) - NEIGHBOURS)[:, None] + np.arange(NEIGHBOURS)
+        apart = np.abs(rows - np.median(rows[windows], axis=1))
+        spread = np.maximum(1.4826 * np.median(apart, axis=0), 1.0)
+        outlier[inside] = np.any(apart > THRESHOLD * spread, axis=1)
+    return outlier

@@ -18,14 +18,17 @@ from estimator.estimate import Estimate, Status
 from estimator.losses import Loss
 from estimator.models.errors import RequestError
 from estimator.models.inertia import matrix_of
+from estimator.residuals import KernelResidual
 from estimator.solvers import Options, solve, solve_with_ipopt
 from estimator.unknowns import NormalizedInertia
 from problems.alignment.campaign import Campaign
 from problems.alignment.determined_rotation import DeterminedTurn, determined_turns, squint
 from problems.alignment.problem import AlignmentModel, alignment_model, alignment_problem
-from problems.alignment.screening import Screening, screen
+from problems.alignment.screening import Screening, isolated_outliers, screen
 
 Solver = Literal["gauss-newton", "ipopt"]
+SCREENING_ROUNDS = 5
+"""Most solves in which samples that stand apart from the fitted model are left out of the next one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,16 +221,36 @@ def solve_campaign(campaign: Campaign, *, solver: Solver = "gauss-newton", effec
         InputError: data that cannot be used; see :mod:`estimator.models.errors`.
     """
     began = time.perf_counter()
-    found = screen(campaign) if screening else _everything(campaign)
-    model = alignment_model(kept(campaign, found), loss=loss, degree=degree)
-    problem = alignment_problem(model, effects)
-    if solver == "gauss-newton":
-        estimate = solve(problem, options)
-    elif solver == "ipopt":
-        estimate = solve_with_ipopt(problem)
-    else:
+    if solver not in ("gauss-newton", "ipopt"):
         raise RequestError(f"no solver is named {solver!r}", where="--solver", limit="gauss-newton or ipopt")
+    found = screen(campaign) if screening else _everything(campaign)
+    for _ in range(SCREENING_ROUNDS):
+        model = alignment_model(kept(campaign, found), loss=loss, degree=degree)
+        problem = alignment_problem(model, effects)
+        estimate = solve(problem, options) if solver == "gauss-newton" else solve_with_ipopt(problem)
+        further = _screened_further(found, model, estimate) if screening else found
+        if further is found:
+            break
+        found = further
     return concluded(model, estimate, found, time.perf_counter() - began)
+
+
+def _screened_further(found: Screening, model: AlignmentModel, estimate: Estimate) -> Screening:
+    """The screening without the samples that stand apart from the fitted model; ``found`` itself if there are none."""
+    doppler, tracker = found.doppler.copy(), found.star_tracker.copy()
+    doppler_index, tracker_index = np.flatnonzero(doppler), np.flatnonzero(tracker)
+    places = {f"star_tracker:{arc.name}": index for arc, index in model.rotation_arcs}
+    for residual, part in zip(estimate.problem.residuals, estimate.parts, strict=True):
+        if not isinstance(residual, KernelResidual):
+            continue
+        wrong = isolated_outliers(part.whitened, residual.arc)
+        if residual.channel == "doppler":
+            doppler[doppler_index[model.doppler_epochs[wrong]]] = False
+        elif residual.name in places:
+            tracker[tracker_index[places[residual.name][wrong]]] = False
+    if doppler.sum() == found.doppler.sum() and tracker.sum() == found.star_tracker.sum():
+        return found
+    return Screening(found.gnss, doppler, tracker)
 
 
 def _everything(campaign: Campaign) -> Screening:
