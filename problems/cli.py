@@ -23,6 +23,7 @@ UsageError: type[Any] = typer.BadParameter.__bases__[0]
 COMMANDS: dict[str, str | dict[str, str]] = {
     "solve": "problems.alignment.commands_solve:solve",
     "explain": "problems.alignment.commands_explain:explain",
+    "design": "problems.alignment.commands_design:design",
     "simulate": "problems.alignment.commands_simulate:simulate",
     "import": {"sentinel1": "problems.alignment.commands_import:import_sentinel1"},
     "slew": "problems.area_survey.commands_slew:slew",
