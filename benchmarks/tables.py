@@ -100,9 +100,12 @@ def speed_page(result: dict[str, Any]) -> str:
             ["load of the machine", f"{full['load']:.1f}"],
         ]), ""]
     rows = [[str(r["positions"]), str(r["degree"]), f"{r['cpu_seconds']:.2f}", f"{1e3 * r['iteration_seconds']:.0f}",
-             f"{r['peak_gigabytes']:.2f}"] for r in result["growth"]]
-    lines += ["Growth, with the same sessions and arcs:", "",
-              _table(["positions", "degree", "CPU s, all", "CPU ms, one iteration", "peak GB"], rows), ""]
+             f"{r['peak_gigabytes']:.2f}"] for r in result.get("growth", [])]
+    if rows:
+        lines += ["Growth, with the same sessions and arcs:", "",
+                  _table(["positions", "degree", "CPU s, all", "CPU ms, one iteration", "peak GB"], rows), ""]
+    if "rivals" not in result:
+        return "\n".join(lines)
     rows = [[r["name"], r["seconds_text"], r["ratio_text"], r["note"]] for r in result["rivals"]]
     lines += [f"Rivals at {result['rival_size']['positions']} positions, degree {result['rival_size']['degree']}, the "
               "same residuals and whitening, from the same start; CPU time in one run:", "",
