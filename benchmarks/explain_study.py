@@ -299,6 +299,7 @@ def run(case: Case, rivals: bool) -> dict[str, Any]:
             "rejected": list(findings.rejected), "looks": findings.looks,
             "table": [{"name": s.name, "score": round(s.score, 2), "degrees": s.degrees, "p": s.p_value,
                        "evidence": round(s.evidence, 2)} for s in findings.tables[0][:5]],
+            "truth_scores": {n: round(s.score, 2) for n in truth for s in findings.tables[0] if s.name == n},
             "gap_p": findings.before.p_value, "gap_after_p": findings.after.p_value,
         }
         result["cpu_seconds"] = time.process_time() - cpu
@@ -500,6 +501,14 @@ def right(entry: dict[str, Any]) -> bool:
         all(any(t in g for t in truths) for g in groups)
 
 
+def _look_alike(entry: dict[str, Any]) -> bool:
+    """Whether the name that was given wrongly scores as the truth does (within 4): the data cannot tell them apart."""
+    scores = {s["name"]: s["score"] for s in entry["table"]}
+    truths = entry.get("truth_scores", {})
+    named = [max((scores.get(n, 0.0) for n in f["group"]), default=0.0) for f in entry["found"]]
+    return bool(truths) and bool(named) and max(named) > max(truths.values()) - 4.0
+
+
 def summary(entries: Iterable[dict[str, Any]]) -> dict[str, Any]:
     """The numbers of the study."""
     by_kind: dict[str, list[dict[str, Any]]] = defaultdict(list)
@@ -523,7 +532,7 @@ def summary(entries: Iterable[dict[str, Any]]) -> dict[str, Any]:
         one[f"{size:g} sigma"] = {
             "campaigns": len(chosen), "right": len(hits) / len(chosen), "single_right":
                 sum(all(len(f["group"]) == 1 for f in e["found"]) for e in hits) / len(chosen),
-            "wrong_name": len(wrong) / len(chosen), "nothing": sum(not e["found"] for e in chosen) / len(chosen),
+            "wrong_name": len(wrong) / len(chosen), "wrong_by_a_look_alike": sum(map(_look_alike, wrong)) / len(chosen), "nothing": sum(not e["found"] for e in chosen) / len(chosen),
             "median_group": float(np.median(sizes)) if sizes else None,
             "by_effect": {n: _share([right(e) for e in chosen if e["effects"][0] == n])
                           for n in sorted({e["effects"][0] for e in chosen})},

@@ -115,7 +115,8 @@ def test_without_its_name_in_the_library_an_effect_is_unknown_not_something_else
                             without=(*HEAVY, "tracker-frame-jump", "gnss-lever-arm"))
     answer = answer_of(explanation)
     assert answer["verdict"] == "unknown", answer["why"]
-    assert "gnss" in {p["channel"] for p in answer["left"]}
+    # Steps at the ends of arcs leave little but ringing beside the trajectory: structure or noise, in the positions.
+    assert {p["channel"] for p in answer["left"]} | {w["residual"] for w in answer["white_noise"]} == {"gnss"}
     assert answer["effects"] == []
 
 
