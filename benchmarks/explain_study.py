@@ -533,7 +533,8 @@ def summary(entries: Iterable[dict[str, Any]]) -> dict[str, Any]:
             "campaigns": len(chosen), "right": len(hits) / len(chosen), "single_right":
                 sum(all(len(f["group"]) == 1 for f in e["found"]) for e in hits) / len(chosen),
             "wrong_name": len(wrong) / len(chosen),
-            "wrong_by_a_look_alike": sum(map(_look_alike, wrong)) / len(chosen), "nothing": sum(not e["found"] for e in chosen) / len(chosen),
+            "wrong_by_a_look_alike": sum(map(_look_alike, wrong)) / len(chosen),
+            "nothing": sum(not e["found"] for e in chosen) / len(chosen),
             "median_group": float(np.median(sizes)) if sizes else None,
             "by_effect": {n: _share([right(e) for e in chosen if e["effects"][0] == n])
                           for n in sorted({e["effects"][0] for e in chosen})},
