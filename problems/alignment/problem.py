@@ -294,7 +294,13 @@ class AlignmentModel:
         tracker, torque = self.campaign.star_tracker, self.campaign.torque
         edges = () if torque is None else tuple(np.concatenate([torque.start, torque.stop]).tolist())
         sigma = np.broadcast_to(tracker.standard_deviation, (len(tracker.time), 3))
-        return attitude_curves(tracker.time, tracker.quaternion, sigma, edges)
+        curves: list[AttitudeCurve] = []
+        for arc in self.campaign.arcs:  # the rotation of one arc says nothing about that of the next
+            inside = (tracker.time >= arc.start - 1e-6) & (tracker.time <= arc.stop + 1e-6)
+            if np.count_nonzero(inside) >= FEWEST_ARC_SAMPLES:
+                curves += attitude_curves(tracker.time[inside], tracker.quaternion[inside], sigma[inside],
+                                          [e for e in edges if arc.start < e < arc.stop])
+        return curves
 
     def smooth_rate(self, time: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
         """Angular rate (n, 3), rad/s, tracker axes, from smoothed attitude; ``otherwise`` where there is no curve.
