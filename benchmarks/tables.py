@@ -108,7 +108,7 @@ def speed_page(result: dict[str, Any]) -> str:
         return "\n".join(lines)
     rows = [[r["name"], r["seconds_text"], r["ratio_text"], r["note"]] for r in result["rivals"]]
     lines += [f"Rivals at {result['rival_size']['positions']} positions, degree {result['rival_size']['degree']}, the "
-              "same residuals and whitening, from the same start; CPU time in one run:", "",
+              "same residuals and whitening, from our starting point (not charged to them); CPU time in one run:", "",
               _table(["solver", "CPU s", "times ours", "note"], rows), ""]
     return "\n".join(lines)
 
