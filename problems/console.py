@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -20,9 +21,6 @@ from estimator.models.errors import BoresightError, InfeasibleError
 
 words = Console(stderr=True, soft_wrap=True)
 """Where sentences, tables and progress go, so that standard output holds nothing but the JSON answer."""
-
-tables = Console(soft_wrap=True)
-"""Where the table for a person goes when no JSON is asked for."""
 
 EXIT_OF_STATUS = {"ok": 0, "quiet": 0, "named": 0, "ambiguous": 1, "unknown": 1, "bad_input": 2}
 
@@ -61,7 +59,7 @@ def answer(result: dict[str, Any], *, as_json: bool, text: Callable[[], object])
     if as_json:
         typer.echo(json.dumps(jsonable(result), allow_nan=False))
     else:
-        tables.print(text())
+        Console(file=sys.stdout, soft_wrap=True).print(text())  # standard output as it is now, redirected or not
     code = EXIT_OF_STATUS.get(str(result.get("status", result.get("verdict", "ok"))), 1)
     if code:
         raise typer.Exit(code)

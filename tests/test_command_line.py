@@ -37,13 +37,8 @@ class Said:
 def boresight(*arguments: object) -> Said:
     """Run a command as the console script does."""
     out, err = io.StringIO(), io.StringIO()
-    with pytest.MonkeyPatch.context() as patch:
-        from problems import console
-
-        patch.setattr(console.words, "file", err)
-        patch.setattr(console.tables, "file", out)
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), pytest.raises(SystemExit) as left:
-            cli.main([str(a) for a in arguments])
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), pytest.raises(SystemExit) as left:
+        cli.main([str(a) for a in arguments])
     return Said(int(left.value.code or 0), out.getvalue(), err.getvalue())
 
 

@@ -176,7 +176,7 @@ def test_jacobian_of_the_whole_problem_equals_finite_differences(tracking: Track
         ("constant-acceleration", np.array([4e-6, -3e-6, 5e-6])),
         ("range-bias:West", np.array([120.0])),
         ("timetag-offset:East", np.array([0.05])),
-        ("station-position-error:South", np.array([80.0, -60.0, 150.0])),
+        ("station-position-error:South", np.array([400.0, -300.0, 750.0])),
     ],
 )
 def test_effects_are_estimated_where_they_are_and_gap_is_said_where_they_are_not(name: str, value: np.ndarray) -> None:
