@@ -8,7 +8,7 @@ give new problems.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -90,20 +90,19 @@ class Problem:
         """
         if name in self.effects:
             return self
-        present = [u for u in self.unknowns if u.name == name]
-        if present:
+        if self.rebuild is not None:  # a dormant effect may act to first order only
+            return self.rebuild((*self.effects, name))
+        if any(u.name == name for u in self.unknowns):
             return replace(self.freeing(name), effects=(*self.effects, name))
-        if self.rebuild is None:
-            raise ValueError(f"this problem takes no effects (asked for {name!r})")
-        return self.rebuild((*self.effects, name))
+        raise ValueError(f"this problem takes no effects (asked for {name!r})")
 
     def prepared(self, values: Mapping[str, np.ndarray]) -> Problem:
         """The same problem with all whitening taken at ``values``."""
         return replace(self, residuals=tuple(r.prepared(values) for r in self.residuals))
 
-    def linearize(self, values: Mapping[str, np.ndarray]) -> list[Linearization]:
-        """Every residual and its Jacobian at ``values``."""
-        return [r.linearize(values) for r in self.residuals]
+    def linearize(self, values: Mapping[str, np.ndarray], only: Collection[str] | None = None) -> list[Linearization]:
+        """Every residual and its Jacobian at ``values``, with ``only`` at least the columns of those unknowns."""
+        return [r.linearize(values, only) for r in self.residuals]
 
     def moved(self, values: Mapping[str, np.ndarray], step: np.ndarray) -> dict[str, np.ndarray]:
         """``values`` moved by the stacked tangent ``step`` of the free unknowns."""

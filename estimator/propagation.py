@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
 
 import casadi as ca
@@ -53,7 +54,7 @@ class Product:
         return tuple(label for m in self.parts for label in m.labels())
 
 
-def _tangent_maps(manifold: Manifold, points: np.ndarray) -> np.ndarray:
+def tangent_maps(manifold: Manifold, points: np.ndarray) -> np.ndarray:
     """Matrices (n, tangent, ambient) that take small ambient changes at ``points`` (n, ambient) to tangent coordinates.
 
     For vectors the identity. For unit quaternions twice the vector part of ``change o conjugate(point)``: a change
@@ -110,11 +111,23 @@ class Flow:
             row += m.ambient
         self.initial_columns = column
         self.columns = column + int(sum(u.manifold.tangent for u in shared))
-        right_side = self._right_side(f"{name}_right_side", inputs, held, derivative)
-        self.step = compiled(self._step(f"{name}_sensitivity", right_side, inputs, held, substeps, True))
-        # For solvers that differentiate by themselves: not machine code, and one list of scalar operations.
-        self.plain = self._step(name, right_side, inputs, held, substeps, False).expand()
+        self._name, self._sizes, self._substeps = name, (inputs, held), substeps
+        self._derivative = derivative
         self._accumulated: dict[int, ca.Function] = {}
+
+    @cached_property
+    def _evaluated(self) -> ca.Function:
+        return self._right_side(f"{self._name}_right_side", *self._sizes, self._derivative)
+
+    @cached_property
+    def step(self) -> ca.Function:
+        """One compiled step of the state and its sensitivities."""
+        return compiled(self._step(f"{self._name}_sensitivity", self._evaluated, *self._sizes, self._substeps, True))
+
+    @cached_property
+    def plain(self) -> ca.Function:
+        """One step of the state for solvers that differentiate by themselves: one list of scalar operations."""
+        return self._step(self._name, self._evaluated, *self._sizes, self._substeps, False).expand()
 
     def _right_side(self, name: str, inputs: int, held: int, derivative: Callable[..., ca.SX]) -> ca.Function:
         """``(x, shared..., u, held, step, fraction) -> (x', dx'/dx, dx'/d(shared tangents))``."""
@@ -188,7 +201,7 @@ class Flow:
                 column, row = self._starts[label]
                 block = start[row : row + m.ambient, column : column + m.tangent]
                 if isinstance(m, UnitQuaternion):
-                    block[:] = _tangent_maps(m, x0[None, row : row + 4])[0].T / 4
+                    block[:] = tangent_maps(m, x0[None, row : row + 4])[0].T / 4
                 else:
                     block[:] = np.eye(m.tangent)
         return start
@@ -260,17 +273,33 @@ class PropagatedSignal:
             pieces.append(np.asarray(values[given[label].name]) if label in given else np.zeros(m.ambient))
         return np.concatenate(pieces)
 
-    def evaluate(self, values: Values) -> tuple[np.ndarray, np.ndarray]:
+    def key(self, values: Values) -> bytes:
+        """Tells whether two sets of values give the same arc."""
         start = self.initial_state(values)
+        return b"".join([start.tobytes(), *(np.asarray(values[u.name], float).tobytes() for u in self.flow.shared)])
+
+    @property
+    def nodes(self) -> int:
+        """Number of nodes up to the last sample."""
+        return int(self.sample_nodes[-1]) + 1 if len(self.sample_nodes) else 1
+
+    def at_nodes(self, values: Values) -> tuple[np.ndarray, np.ndarray]:
+        """States (nodes, ambient) and Jacobians (nodes, tangent, columns) at all nodes up to the last sample."""
+        states, sensitivities = self._propagated(values)
+        return states, tangent_maps(self.manifold, states) @ sensitivities
+
+    def _propagated(self, values: Values) -> tuple[np.ndarray, np.ndarray]:
         shared = [np.asarray(values[u.name], dtype=float) for u in self.flow.shared]
+        last = self.nodes
+        return self.flow.propagate(self.initial_state(values), shared, self.inputs[:last], self.held[: last - 1],
+                                   self.node_time[:last])
+
+    def evaluate(self, values: Values) -> tuple[np.ndarray, np.ndarray]:
         # Solvers ask again at the point where they were; the last answer is kept.
-        key = b"".join([start.tobytes(), *(p.tobytes() for p in shared)])
+        key = self.key(values)
         if self._last.get("answer", (b"",))[0] != key:
-            last = int(self.sample_nodes[-1]) + 1 if len(self.sample_nodes) else 1
-            states, sensitivities = self.flow.propagate(start, shared, self.inputs[:last], self.held[: last - 1],
-                                                        self.node_time[:last])
-            states, sensitivities = states[self.sample_nodes], sensitivities[self.sample_nodes]
-            self._last["answer"] = key, (states, _tangent_maps(self.manifold, states) @ sensitivities)
+            states, sensitivities = (a[self.sample_nodes] for a in self._propagated(values))
+            self._last["answer"] = key, (states, tangent_maps(self.manifold, states) @ sensitivities)
         return self._last["answer"][1]
 
     def symbolic(self, values: Mapping[str, ca.MX]) -> ca.MX:

@@ -11,7 +11,7 @@ noise input of covariance P is the same as whitening with ``R + H P H'``, H bein
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -62,7 +62,8 @@ class Residual(Protocol):
     @property
     def unknowns(self) -> tuple[Unknown, ...]: ...
 
-    def linearize(self, values: Values) -> Linearization: ...
+    def linearize(self, values: Values, only: Collection[str] | None = None) -> Linearization:
+        """The residual and its Jacobian; with ``only`` the columns of those unknowns, where that is cheaper."""
 
     def prepared(self, values: Values) -> Residual:
         """The same residual with whitening (and compressed robust weights) taken at ``values``."""
@@ -207,10 +208,10 @@ class KernelResidual:
             return self if self.factor is not None else replace(self, factor=self._whitening({}))
         return replace(self, factor=self._whitening(self._evaluate(values)[1]))
 
-    def linearize(self, values: Values) -> Linearization:
+    def linearize(self, values: Values, only: Collection[str] | None = None) -> Linearization:
         residual, jacobians, signal_jacobians = self._evaluate(values)
         factor = self.factor if self.factor is not None else self._whitening(jacobians)
-        columns = self.unknowns
+        columns = tuple(u for u in self.unknowns if only is None or u.name in only)
         width = {u.name: u.manifold.tangent for u in columns}
         starts = dict(zip(width, np.concatenate([[0], np.cumsum(list(width.values()))[:-1]]).astype(int), strict=True))
         jacobian = np.empty((self.samples, self.kernel.size, sum(width.values())))
@@ -225,13 +226,20 @@ class KernelResidual:
                 written.add(unknown.name)
 
         for unknown in self.kernel.unknowns:
-            add(unknown, factor @ jacobians[unknown.name])
+            if unknown.name in width:
+                add(unknown, factor @ jacobians[unknown.name])
         for signal in self.signals:
-            chained = (factor @ jacobians[signal.name]) @ signal_jacobians[signal.name]
+            if not any(u.name in width for u in signal.unknowns):
+                continue
+            outer = factor @ jacobians[signal.name]
+            chained = outer @ signal_jacobians[signal.name] if only is None else None
             position = 0
             for unknown in signal.unknowns:
-                add(unknown, chained[:, :, position : position + width[unknown.name]])
-                position += width[unknown.name]
+                place = slice(position, position + unknown.manifold.tangent)
+                position = place.stop
+                if unknown.name in width:
+                    add(unknown, chained[:, :, place] if chained is not None
+                        else outer @ signal_jacobians[signal.name][:, :, place])
         whitened = np.einsum("nij,nj->ni", factor, residual)
         square = np.einsum("ni,ni->n", whitened, whitened)
         keep = np.ones(self.samples) if self.accepted is None else self.accepted.astype(float)

@@ -13,7 +13,7 @@ span, which is exact as well.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -145,7 +145,7 @@ class TrajectoryResidual:
     def _ranks(self) -> int:
         return sum(d.shape[0] for d in self.directions)
 
-    def linearize(self, values: Values) -> Linearization:
+    def linearize(self, values: Values, only: Collection[str] | None = None) -> Linearization:
         zeta = np.asarray(values[self.trajectory.name], dtype=float)
         felt = self._felt()
         counted = float(np.count_nonzero(self.weights)) - (self._ranks() - felt)

@@ -245,7 +245,8 @@ class Workflow:
             touched = problem.with_residuals([r for r in problem.residuals if any(u.name == name for u in r.unknowns)])
             grid = settings(effect)
             stacked = stack(touched.holding(*(u.name for u in touched.unknowns)), touched.linearize(point))
-            found += [signature(stacked, touched, touched.linearize({**point, name: g}), effect, g) for g in grid]
+            found += [signature(stacked, touched, touched.linearize({**point, name: g}, (name,)), effect, g)
+                      for g in grid]
         self._searched = found
         return found
 

@@ -172,6 +172,7 @@ class EffectInstance:
         function: ``(sample, p) -> contribution``.
         state_size: number of internal states.
         state_derivative: ``(sample, p) -> derivative`` of the internal states (state_size).
+        resolution: longest Runge-Kutta step (s) that still follows the internal states.
         zero: the condition under which the contribution is zero, in words.
         reference: where the formula comes from.
     """
@@ -185,6 +186,7 @@ class EffectInstance:
     reference: str
     state_size: int = 0
     state_derivative: Callable[[Sample, Any], Any] | None = None
+    resolution: float = float("inf")
 
 
 @dataclass(frozen=True)
@@ -235,17 +237,20 @@ def axes(name: str, unit: str, scale: float, largest: float, labels: tuple[str, 
 
 def declare(name: str, channel: Channel, parameters: tuple[Parameter, ...], function: Callable[[Sample, Any], Any], *,
             summary: str, formula: str, zero: str, reference: str, state_size: int = 0,
-            state_derivative: Callable[[Sample, Any], Any] | None = None) -> Effect:
+            state_derivative: Callable[[Sample, Any], Any] | None = None,
+            resolution: float = float("inf")) -> Effect:
     """Declare and register an effect that has one instance, the same on every campaign.
 
     Args:
-        name, channel, parameters, function, zero, reference, state_size, state_derivative: see :class:`EffectInstance`.
+        name, channel, parameters, function, zero, reference, state_size, state_derivative, resolution: see
+            :class:`EffectInstance`.
         summary, formula: see :class:`Effect`.
 
     Raises:
         ValueError: an effect of that name is registered already.
     """
-    instance = EffectInstance(name, name, channel, parameters, function, zero, reference, state_size, state_derivative)
+    instance = EffectInstance(name, name, channel, parameters, function, zero, reference, state_size, state_derivative,
+                              resolution)
 
     def instances(layout: Layout) -> tuple[EffectInstance, ...]:
         return (instance,)

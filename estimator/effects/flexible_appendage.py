@@ -39,5 +39,5 @@ EFFECT = declare(
     formula="-K q'' - w x (K q'), q'' + 2 z n q' + n^2 q = -w', K = d d^T",
     zero="coupling = 0",
     reference="Likins, Dynamics and Control of Flexible Space Vehicles, JPL TR 32-1329, 1970 (hybrid coordinates)",
-    state_size=6, state_derivative=state_derivative,
+    state_size=6, state_derivative=state_derivative, resolution=0.125,  # s
 )

@@ -39,5 +39,5 @@ EFFECT = declare(
     formula="-m r x a + m b x (w' x b + w x (w x b)), r = b + xi, a the acceleration of the mass",
     zero="moment = 0",
     reference="Dodge, The New Dynamic Behavior of Liquids in Moving Containers, chapter 3 (spring-mass model)",
-    state_size=18, state_derivative=state_derivative,
+    state_size=18, state_derivative=state_derivative, resolution=0.25,  # s
 )

@@ -61,11 +61,13 @@ class AlignmentSubject:
     def problem(self, effects: Sequence[str], candidates: Sequence[str], *, hold_out: bool) -> Problem:
         """See :class:`estimator.discrepancy.subject.Subject`."""
         moving = [n for n in effects if self._channel(n) in ("torque", "command")]
-        if not candidates and len(moving) > 1:
+        shared: tuple[str, ...] = ()
+        if len(moving) > 1:
             # One equation of motion with every torque serves all combinations, instead of one compiled for each.
-            candidates = [e.name for e in self.library
-                          if e.channel in ("torque", "command") and not (e.state_size and e.channel == "torque")]
-        return alignment_problem(self.training if hold_out else self.everything, effects, candidates=candidates)
+            shared = tuple(e.name for e in self.library
+                           if e.channel in ("torque", "command") and not (e.state_size and e.channel == "torque"))
+        return alignment_problem(self.training if hold_out else self.everything, effects, candidates=candidates,
+                                 in_equation=shared)
 
     def _channel(self, name: str) -> str:
         return next(e.channel for e in self.library if name in (e.name, e.family))

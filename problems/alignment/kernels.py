@@ -9,7 +9,9 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import casadi as ca
+import numpy as np
 
+from estimator.driven_motion import Drive, RightSide
 from estimator.effects.declaration import ENVIRONMENT, EffectInstance, Sample
 from estimator.models import rotations
 from estimator.models.inertia import euler_acceleration, matrix_of
@@ -17,7 +19,7 @@ from estimator.models.radar import beam_doppler
 from estimator.models.star_tracker import attitude_residual, true_attitude
 from estimator.propagation import Flow, Product
 from estimator.residuals import Kernel
-from estimator.unknowns import NormalizedInertia, UnitQuaternion, Unknown, Vector
+from estimator.unknowns import Manifold, NormalizedInertia, UnitQuaternion, Unknown, Vector
 
 ANTENNA = Unknown("antenna_from_tracker", UnitQuaternion(), "rad", 0.035, frame="antenna",
                   description="antenna axes from star tracker axes")
@@ -104,38 +106,30 @@ def doppler_kernel(beams: int, effects: tuple[EffectInstance, ...]) -> Kernel:
                   (("velocity", Vector(3)),), data, (("attitude_error", 3),), build)
 
 
-def rotation_state(effects: Sequence[EffectInstance]) -> tuple[tuple[str, object], ...]:
+def rotation_state(effects: Sequence[EffectInstance]) -> tuple[tuple[str, Manifold], ...]:
     """The parts of the state of a rotation arc: attitude, rate, and the internal states of effects."""
     extra = tuple((f"state:{e.name}", Vector(e.state_size)) for e in effects if e.state_size)
     return (("attitude", UnitQuaternion()), ("rate", Vector(3)), *extra)
 
 
-@lru_cache(maxsize=64)
-def rotation_flow(commanded: bool, effects: tuple[EffectInstance, ...], trace_scale: float, substeps: int) -> Flow:
-    """The equation of motion of a rotation arc.
-
-    Args:
-        commanded: whether the arc has commanded torque (brings in the actuator frame and the inertia's trace).
-        effects: effects of the torque and command channels.
-        trace_scale: nominal trace of the inertia, kg m2 (scale of the unknown ``inertia_trace``).
-        substeps: Runge-Kutta steps per node.
-    """
-    mine = _of_channel(effects, "torque", "command") if commanded else _of_channel(effects, "torque")
-    with_trace = commanded or bool(mine)
+def equation_unknowns(commanded: bool, effects: Sequence[EffectInstance], trace_scale: float) -> tuple[Unknown, ...]:
+    """Unknowns of the equation of motion beside the effects' own; ``effects`` are those in the equation."""
     shared = [INERTIA]
-    if with_trace:
+    if commanded or effects:
         shared.append(inertia_trace_unknown(trace_scale))
     if commanded:
         shared.append(ACTUATOR)
-    shared += [effect_unknown(e) for e in mine]
-    state = rotation_state(mine)
+    return tuple(shared)
 
+
+def equation_of_motion(commanded: bool, mine: tuple[EffectInstance, ...]) -> RightSide:
+    """Right side of the equation of motion of a rotation arc with the torque and command effects ``mine``."""
     def derivative(x: dict[str, ca.SX], theta: dict[str, ca.SX], inputs: ca.SX, held: ca.SX, step: ca.SX,
                    fraction: ca.SX) -> ca.SX:
         inertia = matrix_of(theta["normalized_inertia"])
         rate, attitude = x["rate"], x["attitude"]
         pieces = [rotations.body_from_inertial_derivative(attitude, rate)]
-        if not with_trace:
+        if not (commanded or mine):
             return ca.vertcat(*pieces, euler_acceleration(inertia, rate, ca.SX.zeros(3)))
         trace = theta["inertia_trace"]
         tensor = inertia * trace
@@ -167,9 +161,39 @@ def rotation_flow(commanded: bool, effects: tuple[EffectInstance, ...], trace_sc
         pieces += [state_rates[e.name] for e in mine if e.state_size]
         return ca.vertcat(*pieces)
 
-    return Flow(f"rotation_{'commanded' if commanded else 'free'}_{_key(mine)}", state,  # type: ignore[arg-type]
-                ("attitude", "rate"), shared, ENVIRONMENT_ROWS if mine else 0, 3 if commanded else 0, derivative,
-                substeps)
+    return derivative
+
+
+def substeps_of(effects: Sequence[EffectInstance], step: float) -> int:
+    """Runge-Kutta steps inside a step of ``step`` s that the internal states of the effects need."""
+    finest = min((e.resolution for e in effects if e.state_size), default=np.inf)
+    return max(1, int(np.ceil(step / finest - 1e-9)))
+
+
+@lru_cache(maxsize=64)
+def rotation_flow(commanded: bool, effects: tuple[EffectInstance, ...], trace_scale: float, substeps: int) -> Flow:
+    """The equation of motion of a rotation arc.
+
+    Args:
+        commanded: whether the arc has commanded torque (brings in the actuator frame and the inertia's trace).
+        effects: effects of the torque and command channels.
+        trace_scale: nominal trace of the inertia, kg m2 (scale of the unknown ``inertia_trace``).
+        substeps: Runge-Kutta steps per node.
+    """
+    mine = _of_channel(effects, "torque", "command") if commanded else _of_channel(effects, "torque")
+    shared = [*equation_unknowns(commanded, mine, trace_scale), *(effect_unknown(e) for e in mine)]
+    return Flow(f"rotation_{'commanded' if commanded else 'free'}_{_key(mine)}", rotation_state(mine),
+                ("attitude", "rate"), shared, ENVIRONMENT_ROWS if mine else 0, 3 if commanded else 0,
+                equation_of_motion(commanded, mine), substeps)
+
+
+@lru_cache(maxsize=256)
+def rotation_drive(commanded: bool, effect: EffectInstance, trace_scale: float, substeps: int) -> Drive:
+    """How a torque or command effect that is not in the equation of motion would drive a rotation arc."""
+    state = rotation_state((effect,))
+    return Drive(f"drive_{'commanded' if commanded else 'free'}_{_key((effect,))}", state, 2,
+                 equation_unknowns(commanded, (effect,), trace_scale), effect_unknown(effect), ENVIRONMENT_ROWS,
+                 3 if commanded else 0, equation_of_motion(commanded, (effect,)), substeps)
 
 
 @lru_cache(maxsize=64)
@@ -180,7 +204,7 @@ def attitude_kernel(torque_effects: tuple[EffectInstance, ...], effects: tuple[E
     effects of the star tracker channel, ``environment``.
     """
     mine = _of_channel(effects, "star_tracker")
-    manifold = Product(tuple(m for _, m in rotation_state(torque_effects)))  # type: ignore[misc]
+    manifold = Product(tuple(m for _, m in rotation_state(torque_effects)))
     data: list[tuple[str, int | tuple[int, int]]] = [("measured", 4)]
     if mine:
         data.append(("environment", ENVIRONMENT_ROWS))

@@ -15,6 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
+from estimator.driven_motion import DrivenSignal
 from estimator.effects.declaration import ENVIRONMENT, EffectInstance, Layout
 from estimator.linear_block import LinearBlock, choose_degree, compress
 from estimator.losses import Loss, Quadratic
@@ -46,7 +47,9 @@ from problems.alignment.kernels import (
     doppler_kernel,
     effect_unknown,
     position_effect_kernel,
+    rotation_drive,
     rotation_flow,
+    substeps_of,
 )
 from problems.alignment.starting_point import StartingPoint, starting_point
 
@@ -409,20 +412,24 @@ def _without_short_stretches(campaign: Campaign) -> Campaign:
     return _without_short_stretches(replace(campaign, gnss=shorter))
 
 
-def alignment_problem(model: AlignmentModel, effects: Sequence[str] = (), *,
-                      candidates: Sequence[str] = ()) -> Problem:
+def alignment_problem(model: AlignmentModel, effects: Sequence[str] = (), *, candidates: Sequence[str] = (),
+                      in_equation: Sequence[str] = ()) -> Problem:
     """The joint problem of a prepared campaign.
 
     Args:
         model: the prepared campaign.
         effects: names of effects whose parameters are estimated with everything else.
-        candidates: names of effects that are in the kernels and held at zero, for score tests.
+        candidates: names of effects that are in the kernels and held at zero, for score tests. Torques among them
+            act to first order only (:class:`estimator.driven_motion.DrivenSignal`).
+        in_equation: names of torque and command effects that are in the equation of motion and held at zero, so that
+            one compiled equation serves all combinations of them.
 
     Raises:
         RequestError: an unknown effect.
     """
     active = model.effect_instances(effects)
-    dormant = tuple(e for e in model.effect_instances(candidates) if e not in active)
+    dormant = tuple(e for e in model.effect_instances((*candidates, *in_equation)) if e not in active)
+    moving = frozenset(e.name for e in (*active, *model.effect_instances(in_equation)))
     # One order whatever is active, so that kernels are shared and found in the cache.
     everything = tuple(sorted((*active, *dormant), key=lambda e: e.name))
     unknowns: dict[str, Unknown] = {}
@@ -441,7 +448,7 @@ def alignment_problem(model: AlignmentModel, effects: Sequence[str] = (), *,
     if model.rotation_arcs:
         need(INERTIA, _entries(starting.normalized_inertia))
     doppler = _doppler(model, everything, positions) if has_doppler else None
-    rotations = [_rotation(model, arc, index, everything) for arc, index in model.rotation_arcs]
+    rotations = [_rotation(model, arc, index, everything, moving) for arc, index in model.rotation_arcs]
     for residual, _ in rotations:
         for unknown in residual.unknowns:
             if unknown.name == "inertia_trace":
@@ -464,7 +471,7 @@ def alignment_problem(model: AlignmentModel, effects: Sequence[str] = (), *,
         held.add("inertia_trace")  # without a commanded torque nothing has the unit of a torque
     return Problem(
         unknowns=tuple(unknowns.values()), residuals=tuple(ordered), start=start, held=frozenset(held),
-        rebuild=lambda names: alignment_problem(model, names, candidates=candidates),
+        rebuild=lambda names: alignment_problem(model, names, candidates=candidates, in_equation=in_equation),
         effects=tuple(e.name for e in active),
     )
 
@@ -564,8 +571,8 @@ def _used_in_sessions(model: AlignmentModel, time: np.ndarray, session: np.ndarr
     return used
 
 
-def _rotation(model: AlignmentModel, arc: Arc, index: np.ndarray,
-              effects: tuple[EffectInstance, ...]) -> tuple[KernelResidual, Arc]:
+def _rotation(model: AlignmentModel, arc: Arc, index: np.ndarray, effects: tuple[EffectInstance, ...],
+              in_motion: frozenset[str]) -> tuple[KernelResidual, Arc]:
     tracker, torque = model.campaign.star_tracker, model.campaign.torque
     time = tracker.time[index]
     _, rate = model.start.arc_states[arc.name]
@@ -581,12 +588,21 @@ def _rotation(model: AlignmentModel, arc: Arc, index: np.ndarray,
         for start, stop, value in zip(torque.start, torque.stop, torque.command, strict=True):
             command[(middle > start) & (middle < stop)] += value
     commanded = bool(np.any(command))
-    moving = tuple(e for e in effects if e.channel in (("torque", "command") if commanded else ("torque",)))
+    turning = tuple(e for e in effects if e.channel in (("torque", "command") if commanded else ("torque",)))
+    moving = tuple(e for e in turning if e.name in in_motion)
+    driving = tuple(e for e in turning if e.name not in in_motion)
     trace = float(np.trace(model.campaign.nominal.inertia))
-    flow = rotation_flow(commanded, moving, trace, 1)
-    inputs = model.environment(nodes) if moving else np.zeros((len(nodes), 0))
-    signal = PropagatedSignal("state", flow, _arc_unknowns(arc), nodes, inputs,
-                              command if commanded else np.zeros((len(middle), 0)), sample_nodes)
+    step = float(np.max(np.diff(nodes), initial=0.0))
+    environment = model.environment(nodes) if turning else np.zeros((len(nodes), 0))
+    plain = PropagatedSignal(
+        "state", rotation_flow(commanded, moving, trace, substeps_of(moving, step)), _arc_unknowns(arc), nodes,
+        environment if moving else np.zeros((len(nodes), 0)), command if commanded else np.zeros((len(middle), 0)),
+        sample_nodes)
+    signal: PropagatedSignal | DrivenSignal = plain
+    if driving:
+        drives = tuple(rotation_drive(commanded, e, trace, substeps_of((e,), step)) for e in driving)
+        searched = tuple(np.array([p.search is not None for p in e.parameters]) for e in driving)
+        signal = DrivenSignal(plain, drives, searched, environment)
     kernel = attitude_kernel(moving, tuple(e for e in effects if e.channel == "star_tracker"))
     data = {"measured": tracker.quaternion[index]}
     if "environment" in kernel.labels:
