@@ -134,15 +134,62 @@ def test_jacobians_of_the_book_equal_finite_differences(system: BookSystem) -> N
                 assert (np.abs(numeric - exact[0, :, i]) <= scale + 1e-12).all()
 
 
-def test_the_printed_orbit_is_read_both_ways() -> None:
-    as_perigee, as_latitude = BookCase(), BookCase(perigee_argument=False)
-    first = np.degrees(np.mod(as_perigee.first_state[1], 2 * np.pi))
-    second = np.degrees(as_latitude.first_state[1])
-    assert first == pytest.approx(np.degrees(1.3 + 4.7) - 360 * 0, abs=0.1)
-    assert second == pytest.approx(np.degrees(1.7), abs=0.1)
-    assert BookCase(inclination_in_degrees=True).first_state[2] == pytest.approx(
-        BookCase().first_state[2] * np.pi / 180, rel=1e-3
-    )
+def elements(state: np.ndarray) -> tuple[float, ...]:
+    """Eccentricity, inclination, node, perigee argument and true anomaly (rad) of a state, by its own vectors."""
+    import casadi as ca
+
+    from estimator.models.orbit_spherical import cartesian_from_spherical
+
+    cartesian = np.asarray(ca.DM(cartesian_from_spherical(ca.DM(state[:6])))).ravel()
+    r, v = cartesian[:3], cartesian[3:]
+    h = np.cross(r, v)
+    node = np.cross([0.0, 0.0, 1.0], h)
+    e = np.cross(v, h) / 3.986004418e14 - r / np.linalg.norm(r)  # m3/s2 of the Earth
+
+    def angle(a: np.ndarray, b: np.ndarray) -> float:
+        return float(np.mod(np.arctan2(np.cross(a, b) @ h / np.linalg.norm(h), a @ b), 2 * np.pi))
+
+    tilt = np.arctan2(np.hypot(h[0], h[1]), h[2])
+    return float(np.linalg.norm(e)), float(tilt), float(np.arctan2(node[1], node[0])), angle(node, e), angle(e, r)
+
+
+RADIANS, DEGREES = (0.03, 1.3, 0.4, 4.3), tuple(np.radians([0.03, 1.3, 0.4, 4.3]))
+
+
+@pytest.mark.parametrize("perigee", [True, False])
+@pytest.mark.parametrize(
+    ("reading", "printed"),
+    [
+        ({}, RADIANS),
+        ({"inclination_in_degrees": True}, (DEGREES[0], *RADIANS[1:])),
+        ({"angles_in_degrees": True}, DEGREES),
+    ],
+)
+def test_the_printed_orbit_is_read_every_way(
+    reading: dict[str, bool], printed: tuple[float, ...], perigee: bool
+) -> None:
+    case = BookCase(perigee_argument=perigee, **reading)  # type: ignore[arg-type]
+    eccentricity, tilt, node, argument, anomaly = elements(case.first_state)
+    assert (eccentricity, tilt, node, anomaly) == pytest.approx((0.005, printed[0], printed[1], printed[3]), rel=1e-6)
+    # as the argument of latitude 0.4 is perigee and anomaly together
+    read = argument if perigee else np.mod(argument + anomaly, 2 * np.pi)
+    assert read == pytest.approx(printed[2], abs=1e-7)
+
+
+def test_the_filters_follow_every_reading_of_the_printed_orbit() -> None:
+    for reading in (
+        {"perigee_argument": False},
+        {"inclination_in_degrees": True},
+        {"angles_in_degrees": True, "perigee_argument": False},
+    ):
+        system = BookSystem(BookCase(step=240.0, **reading))  # type: ignore[arg-type]
+        case, simulated = system.case, simulate(system, 3, 4)
+        run = filters.extended_filter(
+            system, case.first_state, np.diag(case.prior**2), simulated.measurements, iterations=4
+        )
+        error = position_errors(case, simulated.truth, run.state)[:, -1]
+        sigma = np.linalg.norm(run.sigma[:, -1, :3] * [1.0, case.radius, case.radius], axis=1)
+        assert not run.diverged().any() and (error < 5 * sigma).all()
 
 
 def test_prior_sigma_of_the_period_is_the_printed_850_seconds() -> None:

@@ -59,10 +59,11 @@ class BookCase:
     """The numbers of the simulation.
 
     Attributes:
-        eccentricity, inclination (rad), node (rad): the book's orbit; inclination 0.03 is read in radians, or with
-            ``inclination_in_degrees`` in degrees.
-        latitude_argument, true_anomaly: rad. ``perigee_argument`` reads the book's "argument of latitude" as that of
-            perigee (0.4); else it is the argument of latitude itself, and the perigee follows from the anomaly.
+        eccentricity, inclination, node, latitude_argument, true_anomaly: the book's orbit. It prints the angles without
+            a unit: radians, since all fit one turn; with ``inclination_in_degrees`` the inclination alone is in degrees
+            (a satellite kept near the stationary orbit), with ``angles_in_degrees`` all of them.
+        perigee_argument: reads the book's "argument of latitude" 0.4 as that of perigee; else it is the argument of
+            latitude itself (perigee plus true anomaly), and the perigee follows from the anomaly.
         station: longitude, latitude (rad), altitude (m).
         sigma_state: prior of the six orbit components; the book gives 850 s of the period.
         sigma_thrust: m/s2; sigma_station: longitude, latitude (rad), altitude (m).
@@ -76,6 +77,7 @@ class BookCase:
     eccentricity: float = 0.005
     inclination: float = 0.03
     inclination_in_degrees: bool = False
+    angles_in_degrees: bool = False
     node: float = 1.3
     latitude_argument: float = 0.4
     true_anomaly: float = 4.3
@@ -108,17 +110,25 @@ class BookCase:
         return np.array([*self.sigma_state, self.sigma_thrust, *self.sigma_station, *self.sigma_noise])
 
     @property
+    def angles(self) -> tuple[float, float, float, float]:
+        """Inclination, right ascension of the node, argument of perigee and true anomaly, rad, as they are read."""
+        unit = np.pi / 180 if self.angles_in_degrees else 1.0
+        tilt = np.pi / 180 if self.angles_in_degrees or self.inclination_in_degrees else 1.0
+        argument, anomaly = self.latitude_argument * unit, self.true_anomaly * unit
+        perigee = argument if self.perigee_argument else argument - anomaly
+        return self.inclination * tilt, self.node * unit, perigee, anomaly
+
+    @cached_property
     def first_state(self) -> np.ndarray:
-        """Expected first state (14,)."""
-        i = np.radians(self.inclination) if self.inclination_in_degrees else self.inclination
-        perigee = self.latitude_argument if self.perigee_argument else self.latitude_argument - self.true_anomaly
-        e, nu = (0.0, self.true_anomaly) if self.stationary else (self.eccentricity, self.true_anomaly)
+        """Expected first state (14,), not to be written to."""
+        i, node, perigee, nu = self.angles
+        e = 0.0 if self.stationary else self.eccentricity
         i = 0.0 if self.stationary else i
         u = perigee + nu
         p = self.radius * (1 - e * e)
         r = p / (1 + e * np.cos(nu))
         speed = np.sqrt(GRAVITATIONAL_PARAMETER / p)
-        node, ci, si = self.node, np.cos(i), np.sin(i)
+        ci, si = np.cos(i), np.sin(i)
         radial = np.array(
             [
                 np.cos(node) * np.cos(u) - np.sin(node) * np.sin(u) * ci,
@@ -135,7 +145,9 @@ class BookCase:
         )
         velocity = speed * e * np.sin(nu) * radial + speed * (1 + e * np.cos(nu)) * along
         spherical = np.asarray(ca.DM(spherical_from_cartesian(ca.DM(np.concatenate([r * radial, velocity]))))).ravel()
-        return np.array([*spherical, 0.0, *self.station, 0.0, 0.0, 0.0, 0.0])
+        state = np.array([*spherical, 0.0, *self.station, 0.0, 0.0, 0.0, 0.0])
+        state.setflags(write=False)
+        return state
 
     @property
     def greenwich(self) -> float:
@@ -161,7 +173,12 @@ def measurement(x: Matrix, greenwich: Matrix) -> Matrix:
 
 
 @lru_cache(maxsize=1)
-def _kernels() -> tuple[Mapped, Mapped]:
+def move_expression() -> ca.Function:
+    """One Runge-Kutta step ``(state, nominal thrust, engine on, step, shaping factors (5)) -> state``, no noise.
+
+    The factors are those of the thrust error and of the four systematic errors, see
+    :func:`estimator.models.orbit_spherical.shaping_step`.
+    """
     x, t, factor = ca.SX.sym("x", SIZE), ca.SX.sym("t"), ca.SX.sym("f", 5)
     nominal, on = ca.SX.sym("n"), ca.SX.sym("o")
     thrust = nominal + on * x[6]  # the thrust error acts only while the engine runs
@@ -171,6 +188,14 @@ def _kernels() -> tuple[Mapped, Mapped]:
     k3 = spherical_rates(y + t / 2 * k2, thrust)
     k4 = spherical_rates(y + t * k3, thrust)
     after = ca.vertcat(y + t / 6 * (k1 + 2 * k2 + 2 * k3 + k4), factor[0] * x[6], x[7:10], factor[1:5] * x[10:14])
+    return ca.Function("book_step", [x, nominal, on, t, factor], [after])
+
+
+@lru_cache(maxsize=1)
+def _kernels() -> tuple[Mapped, Mapped]:
+    x, t, factor = ca.SX.sym("x", SIZE), ca.SX.sym("t"), ca.SX.sym("f", 5)
+    nominal, on = ca.SX.sym("n"), ca.SX.sym("o")
+    after = move_expression()(x, nominal, on, t, factor)
     move = compiled(
         ca.Function(
             "book_move",
@@ -218,6 +243,11 @@ class BookSystem:
         """Whether the engine runs in step ``k``."""
         middle = (k + 0.5) * self.case.step
         return self.case.burn[0] < middle < self.case.burn[1]
+
+    @property
+    def shaping_factors(self) -> np.ndarray:
+        """Factors (5) by which thrust error and systematic errors shrink in one step."""
+        return self._shaping[0]
 
     def propagate(self, k: int, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         on = 1.0 if self.burning(k) else 0.0
