@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from estimator.estimate import Estimate
+from estimator.models.errors import InfeasibleError
 from estimator.observability import UNDETERMINED, determined
 from estimator.problem import NormalEquations, Problem, normal_equations
 from estimator.residuals import Linearization
@@ -98,14 +100,16 @@ def _minimize(problem: Problem, values: Mapping[str, np.ndarray], parts: list[Li
         if size < options.tolerance * 0.1:
             return values, parts, used, ""
         trial = problem.moved(values, step * scales)
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            # A step may lead where a state diverges; the infinite cost that follows rejects it.
+        trial_parts, trial_equations = parts, None
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"), suppress(InfeasibleError):
+            # A step may lead where a state diverges or cannot be propagated; what follows rejects it.
             trial_parts = problem.linearize(trial)
             trial_equations = normal_equations(problem, trial, trial_parts)
         used += 1
-        actual = equations.cost - trial_equations.cost
+        actual = -np.inf if trial_equations is None else equations.cost - trial_equations.cost
         rounding = 1e-13 * abs(equations.cost) * np.sqrt(len(parts) + 1)
-        if np.isfinite(trial_equations.cost) and (actual > 0 or abs(actual) <= rounding):
+        lower = np.isfinite(actual) and (actual > 0 or abs(actual) <= rounding)
+        if trial_equations is not None and lower:
             gain = actual / predicted if predicted > 0 else 1.0
             values, parts, equations = trial, trial_parts, trial_equations
             damping = max(damping * max(1 / 10, 1 - (2 * gain - 1) ** 3), 1e-12) if gain > 0.25 else damping * 2

@@ -19,6 +19,8 @@ FASTEST = 12e3  # m/s, more than any satellite's range changes
 ALLOWANCE = 200e3  # m
 LOWEST_RANGE = 100e3  # m, an orbit's height at the least
 HIGHEST_RANGE = 1e9  # m, beyond the Moon
+_LONGEST_SHIFT = 14 * 3600.0  # s, the largest difference of local time and UTC
+_FAR_STATION = 500e3  # m, off the starting orbit
 _BELOW = np.radians(-5.0)  # rad, elevation that no refraction explains
 
 
@@ -28,8 +30,10 @@ def check_observations(model: OrbitModel) -> None:
     Raises:
         NotFiniteError: a value is NaN or infinite.
         UnitError: a range below an orbit's height (kilometres for metres) or beyond the Moon, an angle out of range.
+        GeometryError: a station that is not on the Earth, a range that no motion reaches.
     """
     s = model.settings
+    _check_stations(model)
     legs = 2.0 if s.legs == "sum" else 1.0
     for o in model.tracking.observations:
         model.station(o.receiver)
@@ -78,6 +82,24 @@ def check_observations(model: OrbitModel) -> None:
         if o.kind == "direction_cosines" and (np.sum(o.value**2, axis=1) > 1.02).any():
             raise UnitError("direction cosines exceed unit length", where=place)
     _check_ranges_together(model)
+
+
+def _check_stations(model: OrbitModel) -> None:
+    for name in dict.fromkeys(n for o in model.tracking.observations for n in (o.receiver, o.transmitter)):
+        place = model.station(name)
+        for what, value, low, high, unit in (
+            ("latitude", np.degrees(place.latitude), -90.0, 90.0, "degrees"),
+            ("longitude", np.degrees(place.longitude), -360.0, 360.0, "degrees"),
+            ("altitude", place.altitude, -500.0, 9000.0, "m"),
+        ):
+            if not low <= value <= high:
+                raise GeometryError(
+                    f"the {what} of station {name} is nowhere on the Earth",
+                    where=name,
+                    value=f"{value:.6g} {unit}",
+                    limit=f"{low:g} to {high:g} {unit}",
+                    remedy="check order and units of latitude, longitude and altitude",
+                )
 
 
 def _check_jumps(model: OrbitModel, o: Observations, one_way: np.ndarray) -> None:
@@ -220,11 +242,60 @@ def _check_legs(model: OrbitModel) -> None:
         )
 
 
+def _misfits(model: OrbitModel) -> dict[str, float]:
+    """How far (m, median over its measurements) each station's ranges and angles are from the starting orbit.
+
+    Angles count by the distance across that they mean at the satellite.
+    """
+    legs = 2.0 if model.settings.legs == "sum" else 1.0
+    found: dict[str, list[float]] = {}
+    for o in model.tracking.observations:
+        if o.receiver != o.transmitter or o.kind not in ("range", "azimuth_elevation"):
+            continue
+        time = model.seconds(o.time)
+        fixed = model.environment.earth_fixed_state(time, kepler(model.position, model.velocity, time))[:, :3]
+        place = model.station(o.receiver)
+        line = fixed - station_position(place.latitude, place.longitude, place.altitude)
+        length = np.linalg.norm(line, axis=1)
+        if o.kind == "range":
+            gap = np.abs((o.value[:, 0] - model.settings.onboard_range_bias) / legs - length)
+        else:
+            local = line / length[:, None] @ east_north_up(place.latitude, place.longitude).T
+            azimuth, elevation = o.value.T
+            seen = np.column_stack(
+                [np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)]
+            )
+            gap = np.linalg.norm(seen - local, axis=1) * length
+        found.setdefault(o.receiver, []).append(float(np.median(gap)))
+    return {name: max(gaps) for name, gaps in found.items()}
+
+
+def _check_places(model: OrbitModel) -> None:
+    """One station far from the starting orbit while all others are near it stands elsewhere, or its clock is wrong."""
+    misfit = _misfits(model)
+    if len(misfit) < 3:
+        return
+    worst = max(misfit, key=lambda name: misfit[name])
+    others = max(gap for name, gap in misfit.items() if name != worst)
+    if misfit[worst] > max(_FAR_STATION, 10.0 * others):
+        place = model.station(worst)
+        raise GeometryError(
+            f"the measurements of {worst} do not fit the initial orbit, while those of all other stations do",
+            where=worst,
+            value=f"{misfit[worst] / 1e3:.0f} km off",
+            limit=f"{others / 1e3:.0f} km, the largest of the others",
+            remedy=f"check latitude {np.degrees(place.latitude):.4f} and longitude {np.degrees(place.longitude):.4f} "
+            "degrees of the station (east positive), and its clock",
+        )
+
+
 def check_start(model: OrbitModel) -> None:
     """Compare the data with the initial orbit that the user gave.
 
     Raises:
-        GeometryError: a station never sees the satellite of that orbit, while it reports measurements.
+        GeometryError: a station never sees the satellite of that orbit, while it reports measurements, or one station
+            alone is far from that orbit.
+        UnitError: ranges about twice or half as long as that orbit's.
     """
     _check_legs(model)
     for name, (_, elevation) in predicted_elevations(model).items():
@@ -248,29 +319,33 @@ def check_start(model: OrbitModel) -> None:
                 limit="above -5 degrees",
                 remedy="check the initial orbit, its epoch and the scale of the times",
             )
+    _check_places(model)
 
 
 def suspicious_stations(model: OrbitModel, estimate: Estimate) -> list[str]:
     """Sentences about stations without which the others agree with one orbit.
 
-    Each station is left out in turn, the rest is solved again from the estimate, and the station is named where that
-    lowers the others' mean square at least a hundredfold, with how far its own data then are from that orbit. A
+    Each station is left out in turn, the rest is solved again from the initial orbit, and the station is named where
+    that lowers the others' mean square at least a hundredfold, with how far its own data then are from that orbit. A
     station at a wrong place, or with a wrong clock, shows so. At most eight stations are tried.
     """
     from estimator.solvers import Options, solve
+    from problems.geo_orbit.problem import orbit_problem
 
     stations = list(dict.fromkeys(o.name for o in model.tracking.observations))
     if not 3 <= len(stations) <= 8:
         return []
     sentences = []
     problem = estimate.problem
+    # what a wrong station spoilt is no place to start from
+    start = orbit_problem(model, problem.effects).start
     with_all = {r.name: float(np.mean(p.whitened**2)) for r, p in zip(problem.residuals, estimate.parts, strict=True)}
     best: tuple[float, str, str] | None = None
     for name in stations:
         kept = [r for r in problem.residuals if r.name.split("/")[0] != name]
         free = {u.name for r in kept for u in r.unknowns}
         part = problem.with_residuals(kept).holding(*(u.name for u in problem.free if u.name not in free))
-        again = solve(part.starting_at(problem.start), Options(iterations=25))
+        again = solve(part.starting_at(start), Options(iterations=25))
         before = float(np.mean([with_all[r.name] for r in kept]))
         after = float(np.mean([np.mean(p.whitened**2) for p in again.parts]))
         if before > 100.0 and after < 0.01 * before and (best is None or after < best[0]):
@@ -287,3 +362,50 @@ def suspicious_stations(model: OrbitModel, estimate: Estimate) -> list[str]:
             "positive), clock and bias"
         )
     return sentences
+
+
+def shifted_times(model: OrbitModel, position: np.ndarray, velocity: np.ndarray) -> str:
+    """A sentence where the solution is the initial orbit with all times shifted; empty where it is not.
+
+    A common error of all time tags by ``d`` turns the orbit about the Earth's axis by the Earth's rotation in that time
+    and moves the satellite along it: ``R(d) kepler(initial, -d)``. The data cannot tell that from another orbit, a
+    given initial orbit can as far as it is good itself: the shift is said where it explains most of the distance and
+    is five times what the rest of the distance allows.
+
+    Args:
+        model: with an initial orbit that the user gave.
+        position, velocity: of the solution at the model's epoch, GCRS, m and m/s.
+    """
+    from scipy.optimize import minimize_scalar
+
+    from estimator.models.earth_orientation import EARTH_ROTATION_RATE
+
+    radius, speed = float(np.linalg.norm(model.position)), float(np.linalg.norm(model.velocity))
+
+    def gaps(shift: np.ndarray) -> np.ndarray:
+        state = kepler(model.position, model.velocity, -shift).reshape(-1, 2, 3)
+        c, s = np.cos(EARTH_ROTATION_RATE * shift)[:, None], np.sin(EARTH_ROTATION_RATE * shift)[:, None]
+        x, y, z = state[..., 0], state[..., 1], state[..., 2]
+        off = np.stack([c * x - s * y, s * x + c * y, z], axis=-1) - [position, velocity]
+        size = np.linalg.norm(off, axis=-1)
+        return np.asarray(np.hypot(size[:, 0], size[:, 1] * radius / speed))
+
+    def gap(shift: float) -> float:
+        return float(gaps(np.array([shift]))[0])
+
+    tried = np.arange(-_LONGEST_SHIFT, _LONGEST_SHIFT + 1, 60.0)
+    nearest = float(tried[int(np.argmin(gaps(tried)))])
+    best = minimize_scalar(gap, bounds=(nearest - 60.0, nearest + 60.0), method="bounded", options={"xatol": 1e-3})
+    without = gap(0.0)
+    rate = abs(gap(best.x + 60.0) ** 2 - best.fun**2) ** 0.5 / 60.0
+    if rate <= 0.0 or best.fun > 0.25 * without:
+        return ""
+    doubt = float(best.fun) / rate
+    if abs(best.x) < max(5.0 * doubt, 1.0):
+        return ""
+    way = "earlier" if best.x > 0 else "later"
+    return (
+        f"the solution is {without / 1e3:.0f} km away from the initial orbit, and {best.fun / 1e3:.0f} km with all "
+        f"times {abs(best.x):.0f} s {way} (known to about {doubt:.0f} s): check the scale of the times (UTC, TAI, GPS, "
+        "local)"
+    )

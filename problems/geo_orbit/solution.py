@@ -13,13 +13,14 @@ import numpy as np
 from estimator.estimate import Estimate, Status
 from estimator.losses import Loss
 from estimator.models.earth_orientation import utc_text
+from estimator.models.errors import GeometryError, InfeasibleError
 from estimator.models.orbit_environment import eme2000_from_gcrs
 from estimator.models.ranging import COMPONENTS
 from estimator.problem import Problem
 from estimator.residuals import KernelResidual
 from estimator.solvers import Options, solve
 from problems.geo_orbit.effects import chosen
-from problems.geo_orbit.plausibility import suspicious_stations
+from problems.geo_orbit.plausibility import shifted_times, suspicious_stations
 from problems.geo_orbit.problem import OrbitModel, orbit_model, orbit_problem
 from problems.geo_orbit.settings import OrbitSettings
 from problems.geo_orbit.tracking import Tracking
@@ -193,9 +194,23 @@ def mean_square(estimate: Estimate) -> float:
 
 
 def solve_from_far(problem: Problem, model: OrbitModel, options: Options | None = None) -> Estimate:
-    """Solve from a start that may be far: directly, and where that ends far from the noise, over a growing horizon."""
+    """Solve from a start that may be far: directly, and where that ends far from the noise, over a growing horizon.
+
+    Raises:
+        GeometryError: the start itself meets the Earth.
+    """
     options = options or Options()
-    best = solve(problem, replace(options, iterations=min(options.iterations, 60)))
+    try:
+        best = solve(problem, replace(options, iterations=min(options.iterations, 60)))
+    except InfeasibleError as error:
+        given = model.settings.position is not None or model.settings.tle is not None
+        raise GeometryError(
+            f"the {'initial orbit' if given else 'first orbit that was found in the data'} meets the Earth",
+            remedy="check the initial orbit and the scale of the times"
+            if given
+            else "check whether ranges are half or the sum of both legs (measurements.range), units, coordinates of "
+            "stations and scale of times, or give an initial orbit",
+        ) from error
     if best.status is not Status.NOT_CONVERGED and mean_square(best) < _FAR:
         return best
     radius = float(np.linalg.norm(model.position))
@@ -276,7 +291,12 @@ def concluded(model: OrbitModel, estimate: Estimate, rejected: dict[str, int], s
     if energy >= 0:
         status = max(status, Status.MODEL_GAP, key=lambda s: s.gravity)
         why.append("the solution is no closed orbit: check stations, units and time scale")
-    if status in (Status.MODEL_GAP, Status.NOT_CONVERGED):
+    elif model.settings.position is not None or model.settings.tle is not None:
+        shift = shifted_times(model, position, velocity)
+        if shift:
+            status = max(status, Status.MODEL_GAP, key=lambda s: s.gravity)
+            why.append(shift)
+    if status in (Status.MODEL_GAP, Status.NOT_CONVERGED) and status is estimate.status:
         why += suspicious_stations(model, estimate)
     if rejected:
         total = sum(rejected.values())
