@@ -22,26 +22,37 @@ from estimator.unknowns import Unknown, Vector
 _SAME_GRID = 1e-3  # relative change of the state at a segment's start up to which its grid is kept
 
 
+_SHORTEST = 1.0  # s that a burn of finite length takes at the least
+
+
 @dataclass(frozen=True)
 class VelocityStep:
-    """An impulsive manoeuvre.
+    """A manoeuvre, impulsive or of finite length.
 
     Attributes:
         unknown: holds (time s after the epoch of the arc's clock, radial, along-track, cross-track m/s), or the three
-            velocities alone when ``time`` is given.
+            velocities alone when ``time`` is given; with ``burning`` the burn's duration (s) comes last, the time is
+            that of its middle, and the velocity is spread evenly over it in the turning orbital axes.
         time: s; None where the time is an unknown too.
+        burning: whether the manoeuvre takes time. The arc must name the acceleration that its ``thrust`` is.
     """
 
     unknown: Unknown
     time: float | None = None
+    burning: bool = False
 
     def at(self, values: Values) -> float:
-        """Time of the step, s."""
+        """Time of the step, or of the middle of the burn, s."""
         return float(values[self.unknown.name][0]) if self.time is None else self.time
 
     def velocity(self, values: Values) -> np.ndarray:
         """Radial, along-track and cross-track velocity (3,), m/s."""
-        return np.asarray(values[self.unknown.name])[-3:]
+        v = np.asarray(values[self.unknown.name])
+        return v[1:4] if self.burning else v[-3:]
+
+    def duration(self, values: Values) -> float:
+        """Length of the burn, s; 0 for an impulse."""
+        return max(float(values[self.unknown.name][4]), _SHORTEST) if self.burning else 0.0
 
 
 def _stepped() -> tuple[ca.Function, ca.Function]:
@@ -69,6 +80,7 @@ class _Segment:
     chain: np.ndarray  # (6, columns): derivative of the segment's initial state along the arc's unknowns
     low: float
     high: float
+    thrusting: tuple[tuple[int, np.ndarray, float], ...] = ()  # first column, velocity, duration of burns that are on
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +99,8 @@ class OrbitArc:
         parameters: (parameters,) values of all force parameters where no unknown gives them.
         steps: velocity steps, in any order.
         breaks: further times at which the equations switch (edges of burns), s.
+        thrust: name of the motion's last active acceleration, constant in orbital axes and with three parameters, which
+            burns of finite length use; "" where there are none.
     """
 
     name: str
@@ -100,6 +114,7 @@ class OrbitArc:
     parameters: np.ndarray
     steps: tuple[VelocityStep, ...] = ()
     breaks: tuple[float, ...] = ()
+    thrust: str = ""
     tolerance: Tolerance = field(default_factory=Tolerance)
     _grids: dict = field(default_factory=dict, repr=False)
     _last: dict = field(default_factory=dict, repr=False)
@@ -139,26 +154,45 @@ class OrbitArc:
         def ahead(t: float) -> bool:
             return (t - self.start) * direction > 0 and (end - t) * direction > 0
 
-        switches = sorted([(t, None) for t in self.breaks if ahead(t)]
-                          + [(s.at(values), s) for s in self.steps if ahead(s.at(values))],
-                          key=lambda item: item[0] * direction)
-        step_columns, at = {}, 6 + sum(u.manifold.tangent for u, _ in self.forces)
+        step_columns, at = {}, self._force_width
         for s in self.steps:
             step_columns[s.unknown.name] = at
             at += s.unknown.manifold.tangent
-        force_columns = slice(6, 6 + sum(u.manifold.tangent for u, _ in self.forces))
+        # A switch is (time, step, side): side 0 an impulse, -1 the ignition and +1 the cut-off of a burn.
+        switches: list[tuple[float, VelocityStep | None, int]] = [(t, None, 0) for t in self.breaks if ahead(t)]
+        burning: list[VelocityStep] = []
+        for s in self.steps:
+            half = 0.5 * s.duration(values)
+            for side in (-1, 1) if s.burning else (0,):
+                if ahead(s.at(values) + side * half):
+                    switches.append((s.at(values) + side * half, s, side))
+            if s.burning and abs(s.at(values) - self.start) < half:
+                burning.append(s)
+        switches.sort(key=lambda item: item[0] * direction)
         segments, t = [], self.start
-        for place, switch in [*switches, (end, None)]:
+        for place, switch, side in [*switches, (end, None, 0)]:
+            on = tuple((step_columns[s.unknown.name], s.velocity(values), s.duration(values)) for s in burning)
+            if self.thrust:
+                parameters = parameters.copy()
+                parameters[self.motion.slices[self.thrust]] = sum((v / d for _, v, d in on), np.zeros(3))
             grid = self._grid(t, place, x)
             orbit, found = propagate(self.motion.step, self.motion.step.start(x), parameters, self.inputs,
                                      np.array([t, place]), grid=grid, tolerance=self.tolerance)
             if grid is None:
                 self._keep(t, place, x, found)
-            segments.append(_Segment(orbit, chain, min(t, place), max(t, place)))
+            segments.append(_Segment(orbit, chain, min(t, place), max(t, place), on))
             x, carried = orbit.values[-1][:6], orbit.values[-1][6:].reshape(-1, 6).T
-            chain = carried[:, :6] @ chain
-            chain[:, force_columns] += carried[:, 6:]
-            if switch is not None:
+            chain = self._chained(carried, chain, on)
+            if switch is not None and side != 0:
+                # At its edges a burn changes the rate of the state, not the state.
+                thrust = np.asarray(_SLOPES(x, np.zeros(3))[1]) @ (switch.velocity(values) / switch.duration(values))
+                change = side * direction * thrust
+                column = step_columns[switch.unknown.name]
+                chain = chain.copy()
+                chain[:, column] += change
+                chain[:, column + 4] += 0.5 * side * change
+                burning = [b for b in burning if b is not switch] if side == direction else [*burning, switch]
+            elif switch is not None:
                 velocity = switch.velocity(values)
                 u = self.inputs(np.array([place]))[0]
                 other = (np.asarray(_AFTER(x, velocity)).ravel() if direction == 1 else before_step(x, velocity))
@@ -178,6 +212,23 @@ class OrbitArc:
                 x = other
             t = place
         return segments
+
+    @property
+    def _force_width(self) -> int:
+        """Columns of the initial state and of the force parameters."""
+        return 6 + sum(u.manifold.tangent for u, _ in self.forces)
+
+    def _chained(self, carried: np.ndarray, chain: np.ndarray,
+                 on: tuple[tuple[int, np.ndarray, float], ...]) -> np.ndarray:
+        """Derivatives (..., 6, columns) along the arc's unknowns from those of a segment (..., 6, own columns)."""
+        width = self._force_width
+        result = carried[..., :6] @ chain
+        result[..., 6:width] += carried[..., 6:width]
+        for column, velocity, duration in on:
+            thrust = carried[..., width : width + 3]
+            result[..., column + 1 : column + 4] += thrust / duration
+            result[..., column + 4] -= thrust @ (velocity / duration**2)
+        return result
 
     def _grid(self, a: float, b: float, x: np.ndarray) -> Grid | None:
         kept = self._grids.get((a, b))
@@ -199,15 +250,13 @@ class OrbitArc:
         states, derivatives = np.empty((len(times), 6)), np.zeros((len(times), 6, self.columns))
         left = np.ones(len(times), dtype=bool)
         segments = sorted(self.segments(values), key=lambda s: s.low)
-        width = 6 + sum(u.manifold.tangent for u, _ in self.forces)
         for number, segment in enumerate(segments):
             inside = left & (times < segment.high) if number + 1 < len(segments) else left
             if not inside.any():
                 continue
             left = left & ~inside
             states[inside], local = segment.orbit.at(times[inside])
-            derivatives[inside] = local[:, :, :6] @ segment.chain
-            derivatives[inside, :, 6:width] += local[:, :, 6:]
+            derivatives[inside] = self._chained(local, segment.chain, segment.thrusting)
         return states, derivatives
 
 

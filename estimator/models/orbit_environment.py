@@ -194,6 +194,7 @@ class SpaceEnvironment:
         days = np.linspace(first, last, count)
         tt = days + _TT_MINUS_TAI / _DAY
         x, y, s = erfa.xys06a(2451545.0, tt)
+        t["days"] = days
         t["xys"] = CubicSpline(days, np.column_stack([x, y, s]))
         earth, _ = erfa.epv00(2451545.0, tt)
         t["sun"] = CubicSpline(days, -earth["p"] * _ASTRONOMICAL_UNIT)
@@ -232,6 +233,27 @@ class SpaceEnvironment:
     def moon(self, time: np.ndarray) -> np.ndarray:
         """Geocentric position (n, 3) of the Moon, GCRS, m."""
         return self._tables["moon"](self._days(time))
+
+    def driving(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rotation (n, 3, 3) from GCRS to ITRS, Sun and Moon (n, 3), m: what an integration asks for at every stage.
+
+        One table of everything that varies slowly, made at the first call, in place of eight: the same to rounding, and
+        several times as fast for the few times of one step.
+        """
+        import erfa
+
+        t = self._tables
+        if "driving" not in t:
+            knots = (t["days"] - t["day0"]) * _DAY
+            intermediate, _, pole = self.orientation_parts(knots)
+            columns = [intermediate.reshape(-1, 9), pole.reshape(-1, 9), self.sun(knots), self.moon(knots),
+                       np.reshape(t["ut1_minus_tai"](t["days"]), (-1, 1))]
+            t["driving"] = CubicSpline(t["days"], np.column_stack(columns))
+        days = self._days(time)
+        row = t["driving"](days)
+        angle = erfa.era00(2451545.0, days + row[:, 24] / _DAY)
+        rotation = row[:, 9:18].reshape(-1, 3, 3) @ _about_z(np.asarray(angle)) @ row[:, :9].reshape(-1, 3, 3)
+        return rotation, row[:, 18:21], row[:, 21:24]
 
     def earth_fixed_state(self, time: np.ndarray, state: np.ndarray) -> np.ndarray:
         """Earth-fixed position and velocity (n, 6) of celestial ones."""

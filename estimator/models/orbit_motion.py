@@ -87,6 +87,14 @@ def _pressure(s: MotionSample, p: Matrix) -> Matrix:
     return p[0] * solar_pressure(s.position, s.sun, s.area_over_mass)
 
 
+def _oblique(s: MotionSample, p: Matrix) -> Matrix:
+    pressure = solar_pressure(s.position, s.sun, s.area_over_mass)
+    line = (s.sun - s.position) / ca.norm_2(s.sun - s.position)
+    across = ca.vertcat(-line[1], line[0], 0.0)  # celestial pole x line to the Sun
+    size = ca.dot(pressure, -line)
+    return size * (p[0] * across + p[1] * ca.cross(line, across))
+
+
 def _drag(s: MotionSample, p: Matrix) -> Matrix:
     return p[0] * drag(s.position, s.velocity, s.spin, s.area_over_mass)
 
@@ -117,6 +125,9 @@ SUN = Acceleration("sun", 0, _sun)
 MOON = Acceleration("moon", 0, _moon)
 LUNI_SOLAR = Acceleration("luni-solar-gravity", 1, _sun_and_moon)
 SOLAR_PRESSURE = Acceleration("solar-radiation-pressure", 1, _pressure)
+OBLIQUE_PRESSURE = Acceleration("solar-radiation-pressure:oblique", 2, _oblique)
+"""Pressure of sunlight at right angles to its line: towards celestial pole x Sun, and towards the pole's side; zero in
+shadow. Panels that are not square to the Sun, and the body that turns with the Earth, push so."""
 DRAG = Acceleration("drag", 1, _drag)
 BURN = Acceleration("burn", 0, _burn)
 BURN_SCALE = Acceleration("thrust-scale-error", 1, _burn_scale)
@@ -126,6 +137,10 @@ BURN_MISALIGNMENT = Acceleration("thrust-misalignment", 2, _burn_turned)
 def constant_acceleration(name: str, *, linear: bool = False, orbital: bool = False) -> Acceleration:
     """An acceleration of constant (or linear in time, from the epoch) components in celestial or orbital axes."""
     return Acceleration(name, 6 if linear else 3, _orbital if orbital else _celestial)
+
+
+THRUST = constant_acceleration("thrust", orbital=True)
+"""Acceleration of a burn of finite length, on between its edges: :class:`estimator.orbit_signal.VelocityStep`."""
 
 
 class _Extension:
@@ -238,12 +253,12 @@ def motion_inputs(environment: SpaceEnvironment, burns: Sequence[Burn] = ()) -> 
     """The outside inputs (n, INPUTS) of :func:`motion` as a function of time (n,), s after the epoch."""
 
     def inputs(time: np.ndarray) -> np.ndarray:
-        rotation = environment.earth_fixed_from_celestial(time)
+        rotation, sun, moon = environment.driving(time)
         thrust = np.zeros((len(time), 3))
         for burn in burns:
             thrust[(time > burn.start) & (time < burn.stop)] += burn.acceleration
         return np.column_stack(
-            [rotation.transpose(0, 2, 1).reshape(-1, 9), environment.sun(time), environment.moon(time), time, thrust]
+            [rotation.transpose(0, 2, 1).reshape(-1, 9), sun, moon, time, thrust]
         )
 
     return inputs

@@ -19,6 +19,7 @@ from estimator.models.orbit_motion import (
     BURN_MISALIGNMENT,
     BURN_SCALE,
     LUNI_SOLAR,
+    OBLIQUE_PRESSURE,
     SOLAR_PRESSURE,
     Acceleration,
     constant_acceleration,
@@ -193,6 +194,18 @@ def instances(layout: OrbitLayout) -> tuple[OrbitEffect, ...]:
             SOLAR_PRESSURE,
             "coefficient added to the model's = 0",
             "Montenbruck and Gill (2000), equation 3.75",
+        )
+    if layout.reflection:
+        force(
+            "solar-radiation-pressure:oblique",
+            (
+                Parameter("across", "1", 0.2, (-layout.reflection, layout.reflection)),
+                Parameter("normal", "1", 0.2, (-layout.reflection, layout.reflection)),
+            ),
+            OBLIQUE_PRESSURE,
+            "both coefficients = 0",
+            "panels and body do not push along the line from the Sun alone: Soop (1994), Handbook of Geostationary "
+            "Orbits, section 3.5",
         )
     if not layout.luni_solar:
         force(

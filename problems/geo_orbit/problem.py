@@ -25,6 +25,7 @@ from estimator.models.orbit_motion import (
     MOON,
     SOLAR_PRESSURE,
     SUN,
+    THRUST,
     Acceleration,
     Burn,
     constant_acceleration,
@@ -66,7 +67,8 @@ class OrbitModel:
         epoch: TAI, datetime64[us]; all seconds count from it.
         position, velocity: where to start, GCRS, m and m/s.
         loss: robust loss of every measurement.
-        velocity_steps: (time s after the epoch, sigma m/s) of velocity steps that are estimated.
+        velocity_steps: times (s after the epoch) of velocity steps that are estimated.
+        finite_burns: whether the motion carries derivatives along a thrust, which manoeuvres of finite length need.
     """
 
     tracking: Tracking
@@ -76,6 +78,7 @@ class OrbitModel:
     velocity: np.ndarray
     loss: Loss = field(default_factory=Quadratic)
     velocity_steps: tuple[float, ...] = ()
+    finite_burns: bool = False
 
     def seconds(self, tai: np.ndarray) -> np.ndarray:
         """Seconds after the epoch of TAI instants."""
@@ -290,11 +293,11 @@ def orbit_problem(model: OrbitModel, effects: Sequence[str] = (), *, candidates:
     Raises:
         RequestError: an unknown effect.
     """
-    active = chosen(model.layout, effects)
-    dormant = tuple(e for e in chosen(model.layout, candidates) if e not in active)
+    estimated = chosen(model.layout, effects)
+    dormant = tuple(e for e in chosen(model.layout, candidates) if e not in estimated)
     # Always in the library's order: the compiled equations then do not depend on which of them are estimated.
     order = {e.name: i for i, e in enumerate(instances(model.layout))}
-    everything = tuple(sorted((*active, *dormant), key=lambda e: order[e.name]))
+    everything = tuple(sorted((*estimated, *dormant), key=lambda e: order[e.name]))
     s = model.settings
     present, values, force_unknowns = _accelerations(model)
     unknowns: dict[str, Unknown] = {}
@@ -317,7 +320,11 @@ def orbit_problem(model: OrbitModel, effects: Sequence[str] = (), *, candidates:
     field_ = gravity_field(s.gravity, s.degree)
     if s.order < s.degree:
         field_ = field_.truncated(s.degree, s.order)
-    equations = motion(field_, present, [name for _, name in force_unknowns], s.area / s.mass)
+    active = [name for _, name in force_unknowns]
+    if model.finite_burns:
+        present.append(THRUST)
+        active.append(THRUST.name)
+    equations = motion(field_, present, active, s.area / s.mass)
     parameters = np.concatenate([np.zeros(0), *(values.get(a.name, np.zeros(a.size)) for a in present)])
     steps = []
     for number, time in enumerate(model.velocity_steps):
@@ -347,6 +354,7 @@ def orbit_problem(model: OrbitModel, effects: Sequence[str] = (), *, candidates:
         parameters,
         tuple(steps),
         edges,
+        THRUST.name if model.finite_burns else "",
     )
     residuals: list[Residual] = []
     for o in model.tracking.observations:
@@ -358,7 +366,7 @@ def orbit_problem(model: OrbitModel, effects: Sequence[str] = (), *, candidates:
         start,
         held,
         rebuild=lambda names: orbit_problem(model, names, candidates=candidates),
-        effects=tuple(e.name for e in active),
+        effects=tuple(e.name for e in estimated),
     )
 
 
