@@ -272,9 +272,9 @@ def tables(result: dict[str, Any]) -> str:
         low, high = rows[0]["nees_band"]
         lines += [
             f"{rows[0]['runs']} realizations, a measurement every {rows[0]['step_s']:.0f} s. Error of position after "
-            "24 h, the method's own sigma of it, and their ratio: medians. NEES: normalized estimation error squared of the "
-            "six components of motion, per component, mean of all realizations, at the end for filters and at the "
-            f"start for smoothers and batch; its 95 % band is {low:.2f} to {high:.2f} (**bold** inside). Said: "
+            "24 h, the method's own sigma of it, and their ratio: medians. NEES: normalized estimation error squared "
+            "of the six components of motion, per component, mean of all realizations, at the end for filters and at "
+            f"the start for smoothers and batch; its 95 % band is {low:.2f} to {high:.2f} (**bold** inside). Said: "
             "realizations in which the method itself says that it is not to be trusted; the batch says so too where "
             "the prior is missed by three sigma in all components at once.",
             "",
