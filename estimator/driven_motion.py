@@ -7,7 +7,7 @@ plain model gives anyway, that is a sum along the arc,
 
     change(t) = Phi(t) * integral of Phi(s)^-1 B(s) ds,
 
-``B`` being the derivative of the equation's right side along the parameters. One small kernel per effect is compiled, for
+``B`` being the derivative of the right side along the parameters. One small kernel per effect is compiled, for
 any combination of effects in the model, and a mode is tried at another frequency for the price of its own few states.
 """
 

@@ -219,8 +219,14 @@ class TrajectoryResidual:
         return ca.vertcat(zeta, rest)
 
 
-def trajectory_unknown(directions: Sequence[np.ndarray]) -> Unknown:
-    """The unknown of the felt directions: unit information from the positions, so a scale far above one."""
+def trajectory_unknown(directions: Sequence[np.ndarray], *, displaced: bool = False) -> Unknown:
+    """The unknown of the felt directions: unit information from the positions, so a scale far above one.
+
+    Args:
+        directions: per axis (rank, felt).
+        displaced: whether an effect displaces the positions. A wrong clock moves the trajectory by kilometres, which
+            the positions alone would never allow: the yardstick of what is determined must leave room for it.
+    """
     size = sum(d.shape[1] for d in directions)
-    return Unknown("trajectory", Vector(size), "1", 100.0, nuisance=True,
+    return Unknown("trajectory", Vector(size), "1", 1e6 if displaced else 100.0, nuisance=True,
                    description="Fourier coefficients of the trajectory, in the directions that other data feel")

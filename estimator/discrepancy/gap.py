@@ -1,15 +1,16 @@
 """Where model and data disagree: channel, arcs, time scale and size, with a test that holds for any sampling.
 
-Two kinds of structure are looked for. Slow: the residuals of every arc and component are projected on a few smooth
+Three kinds of structure are looked for. Slow: the residuals of every arc and component are projected on a few smooth
 functions of time (Legendre polynomials of the arc), with everything that the fit absorbs projected out of them first;
 the sum of squares is chi-square without a gap. Fast: the sum of products of neighbouring samples of a component is
-normal without a gap. Neither minds irregular sampling or gaps. A sum of squares that is too large without either is
-noise above the declared one, and said as such.
+normal without a gap. Periodic: the periodograms of the arcs of a component, one by one and added up, are chi-square at
+each frequency without a gap. None minds irregular sampling or gaps. A sum of squares that is too large
+without any is noise above the declared one, and said as such.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +22,8 @@ from estimator.problem import Problem
 from estimator.residuals import KernelResidual, Linearization
 from estimator.trajectory_residual import TrajectoryResidual
 
-SMOOTH = 6  # Legendre polynomials per arc and component
+SMOOTH = 8  # Legendre polynomials per arc and component
+LONGEST_PIECE = 2048  # samples of a stretch of positions in one periodogram
 LEVEL = 0.002  # probability of a gap where there is none, over all places together
 
 
@@ -87,6 +89,14 @@ class _Cell:
     dominant: int
     floor: float
     time_scale: float | None = None
+    tests: int = 1  # independent frequencies of which the most striking one is shown
+    period: float | None = None  # s
+    members: tuple[_Cell, ...] = ()  # the cells of a sum
+
+    @property
+    def fast(self) -> bool:
+        """Whether it tells of structure faster than the smooth functions of an arc."""
+        return self.time_scale is not None
 
 
 def find_gap(problem: Problem, stacked: Stack, parts: Sequence[Linearization]) -> Gap:
@@ -105,23 +115,46 @@ def find_gap(problem: Problem, stacked: Stack, parts: Sequence[Linearization]) -
         elif isinstance(residual, TrajectoryResidual):
             cells += _position_cells(residual, part)
         cells += _serial_cells(residual, part, stacked.scale[residual.name])
-    tests = max(len(cells), 1)
-    structured = {c.channel for c in cells if c.p_value < LEVEL / tests}
+    cells += _together(cells)
+    cells += _periodic_cells(problem, parts, stacked)
+    # Half of the level belongs to the few slow tests, half to the many fast ones.
+    tests = {fast: 2 * max(sum(c.tests for c in cells if c.fast is fast), 1) for fast in (False, True)}
+    significant = [c for c in cells if c.p_value < LEVEL / tests[c.fast]]
+    structured = {c.channel for c in significant}
     white = {name: s for name, s in stacked.scale.items() if s > 1}
     for residual, part in zip(problem.residuals, parts, strict=True):
         excess = _noise_excess(part, stacked, stacked.blocks[residual.name], len(problem.residuals))
         if excess > 1 and residual.channel not in structured:
             white[residual.name] = max(white.get(residual.name, 1.0), excess)
-    threshold = LEVEL / tests
-    significant = [c for c in cells if c.p_value < threshold]
     places = []
     for channel in dict.fromkeys(c.channel for c in significant):
         mine = [c for c in significant if c.channel == channel]
         everything = [c for c in cells if c.channel == channel]
         unit = next(r.unit for r in problem.residuals if r.channel == channel)
         places.append(_place(channel, unit, mine, everything, tests))
-    smallest = min((c.p_value for c in cells), default=1.0)
-    return Gap(tuple(sorted(places, key=lambda p: p.p_value)), tuple(white.items()), min(1.0, smallest * tests))
+    smallest = min((c.p_value * tests[c.fast] for c in cells), default=1.0)
+    return Gap(tuple(sorted(places, key=lambda p: p.p_value)), tuple(white.items()), min(1.0, smallest))
+
+
+def _together(cells: Sequence[_Cell]) -> list[_Cell]:
+    """Slow structure of all arcs of a component, and of all components: weak in each, it may be plain in the sum."""
+    found = []
+    slow = [c for c in cells if not c.fast]
+    for channel in dict.fromkeys(c.channel for c in slow):
+        mine = [c for c in slow if c.channel == channel]
+        components = sorted({c.component for c in mine})
+        whole = float(chi2.sf(sum(c.statistic for c in mine), sum(c.degrees for c in mine)))
+        for k in components:
+            some = [c for c in mine if c.component == k]
+            if len(some) < 2 and len(components) < 2:
+                continue
+            statistic, degrees = sum(c.statistic for c in some), sum(c.degrees for c in some)
+            own = float(chi2.sf(statistic, degrees))
+            found.append(_Cell(channel, "", k, sum(c.samples for c in some), some[0].start, some[-1].stop, statistic,
+                               degrees, min(own, whole), sum(c.smooth_power for c in some),
+                               max(some, key=lambda c: c.smooth_power).dominant, some[0].floor, tests=2,
+                               members=tuple(some)))
+    return found
 
 
 def _kernel_cells(residual: KernelResidual, part: Linearization, rows: slice, stacked: Stack) -> list[_Cell]:
@@ -222,6 +255,81 @@ def _serial_cells(residual: object, part: Linearization, scale: float) -> list[_
     return cells
 
 
+def _series(problem: Problem, parts: Sequence[Linearization], stacked: Stack,
+            ) -> Iterator[tuple[str, str, np.ndarray, np.ndarray, np.ndarray]]:
+    """Channel, arc, times (n,), whitened residuals (n, m) and noise (m,) of every arc and stretch of positions."""
+    for residual, part in zip(problem.residuals, parts, strict=True):
+        if isinstance(residual, KernelResidual):
+            noise = np.sqrt(np.mean(residual.standard_deviation**2, axis=0)) * np.ones(part.whitened.shape[1])
+            whitened = part.whitened / stacked.scale[residual.name]
+            for label, name in enumerate(residual.arc_names):
+                inside = np.flatnonzero((residual.arc == label) & (part.weight > 0))
+                inside = inside[np.argsort(residual.time[inside], kind="stable")]
+                yield residual.channel, name, residual.time[inside], whitened[inside], noise
+        elif isinstance(residual, TrajectoryResidual):
+            used = residual.weights[:, 0] > 0
+            noise = np.sqrt(np.mean(residual.standard_deviation**2, axis=0))
+            whitened = (part.residual / residual.standard_deviation)[used]
+            for name, inside in _marked(residual, used):
+                for piece in np.array_split(inside, -(-len(inside) // LONGEST_PIECE)):
+                    yield residual.channel, name, residual.time[used][piece], whitened[piece], noise
+
+
+def _periodic_cells(problem: Problem, parts: Sequence[Linearization], stacked: Stack) -> list[_Cell]:
+    """The most striking frequency of every arc and component, and of all arcs of a component together."""
+    by_channel: dict[str, list[tuple[str, np.ndarray, np.ndarray, np.ndarray]]] = {}
+    for channel, name, time, whitened, noise in _series(problem, parts, stacked):
+        if len(time) >= 8 * SMOOTH and time[-1] > time[0]:
+            by_channel.setdefault(channel, []).append((name, time, whitened, noise))
+    cells = []
+    for channel, arcs in by_channel.items():
+        step = float(np.median([np.median(np.diff(time)) for _, time, _, _ in arcs]))
+        length = max(float(time[-1] - time[0]) for _, time, _, _ in arcs)
+        if step <= 0 or length < 4 * SMOOTH * step:
+            continue
+        # Slower than two periods in an arc is the matter of the smooth functions.
+        bins = int(2 ** np.ceil(np.log2(2 * length / step + 2)))
+        frequency = np.fft.rfftfreq(bins, step)
+        seen = (frequency >= 2 / length) & (frequency <= 0.5 / step)
+        frequency = frequency[seen]
+        number = len(frequency)
+        components = arcs[0][2].shape[1]
+        power = np.zeros((len(arcs), components, number))  # each chi-square of two degrees without a gap
+        for i, (_, time, whitened, _) in enumerate(arcs):
+            place = np.rint((time - time[0]) / step).astype(int)
+            for k in range(components):
+                level = max(float(np.mean(whitened[:, k] ** 2)), 1.0)  # what stays below the declared noise is no gap
+                spread = np.bincount(place, whitened[:, k], minlength=bins)
+                power[i, k] = 2 * np.abs(np.fft.rfft(spread)[seen]) ** 2 / (len(time) * level)
+        samples = sum(len(time) for _, time, _, _ in arcs)
+        everywhere = power.sum(axis=(0, 1))
+        common = chi2.sf(everywhere, 2 * len(arcs) * components)
+        for k in range(components):
+            floor = float(arcs[0][3][k])
+            for i, (name, time, _, _) in enumerate(arcs if len(arcs) > 1 else ()):
+                top = int(np.argmax(power[i, k]))
+                cells.append(_periodic_cell(channel, name, k, time, len(time), power[i, k, top], 2, floor,
+                                            frequency[top], number))
+            total = power[:, k].sum(axis=0)
+            p_value = chi2.sf(total, 2 * len(arcs))
+            top = int(np.argmin(np.minimum(p_value, common)))
+            whole = np.array([arcs[0][1][0], arcs[-1][1][-1]])
+            cell = _periodic_cell(channel, "all arcs" if len(arcs) > 1 else arcs[0][0], k, whole, samples, total[top],
+                                  2 * len(arcs), floor, frequency[top], number)
+            # Where all components together tell more, each shows what it has of it.
+            cell.p_value = float(min(p_value[top], common[top]))
+            cell.tests = 2 * number
+            cells.append(cell)
+    return cells
+
+
+def _periodic_cell(channel: str, arc: str, component: int, time: np.ndarray, samples: int, power: float, degrees: int,
+                   floor: float, frequency: float, tests: int) -> _Cell:
+    return _Cell(channel, arc, component, samples, float(time[0]), float(time[-1]), float(power), degrees,
+                 float(chi2.sf(power, degrees)), float(power), 1, floor, 0.5 / float(frequency), tests,
+                 1.0 / float(frequency))
+
+
 def _correlation_time(x: np.ndarray, step: float) -> float:
     """Lag (s) at which the autocorrelation has fallen to 1/e of its value at the first lag."""
     centred = x - x.mean()
@@ -244,10 +352,20 @@ def _marked(residual: TrajectoryResidual, used: np.ndarray) -> list[tuple[str, n
             for i, piece in enumerate(np.split(np.arange(count), edges)) if len(piece)]
 
 
-def _place(channel: str, unit: str, cells: list[_Cell], everything: list[_Cell], tests: int) -> Place:
-    # Slow structure says which arcs; products of neighbours, taken over all of them, speak where it finds none.
-    cells = [c for c in cells if c.time_scale is None] or cells
-    everything = [c for c in everything if c.time_scale is None]
+def _place(channel: str, unit: str, cells: list[_Cell], everything: list[_Cell],
+           tests: Mapping[bool, int]) -> Place:
+    p = min(1.0, min(c.p_value * tests[c.fast] for c in cells))
+    # Slow structure says which arcs; periods, and products of neighbours over all arcs, speak where it finds none.
+    slow = [c for c in cells if not c.fast and not c.members]
+    if not slow:  # what only the sum over arcs shows is where most of it is
+        slow = [m for c in cells for m in sorted(c.members, key=lambda m: m.degrees - m.smooth_power)[:4]
+                if m.smooth_power > m.degrees]
+    periodic = [c for c in cells if c.period is not None]
+    if periodic:
+        first = min(periodic, key=lambda c: c.p_value)
+        periodic = [c for c in periodic if (c.arc == "all arcs") == (first.arc == "all arcs")]
+    cells = slow or periodic or cells
+    everything = [c for c in everything if not c.fast and not c.members] or everything
     arcs = tuple(dict.fromkeys(c.arc for c in cells))
     power: dict[int, float] = {}
     for c in cells:
@@ -264,14 +382,18 @@ def _place(channel: str, unit: str, cells: list[_Cell], everything: list[_Cell],
     serial = [c.time_scale for c in cells if c.time_scale is not None]
     if serial and len(serial) == len(cells):
         scale = float(np.median(serial))
-    p = min(1.0, min(c.p_value for c in cells) * tests)
     which = {"doppler": "beam", "star_tracker": "axis", "gnss": "axis"}.get(channel, "component")
     all_components = {c.component for c in everything}
     parts = "all " + ("beams" if which == "beam" else "axes") if set(components) == all_components else \
         f"{which} " + ", ".join(str(c) for c in components)
     all_arcs = {c.arc for c in everything}
     where = "every arc" if set(arcs) == all_arcs else ("" if serial else "arcs ") + ", ".join(arcs)
+    periods = [c for c in cells if c.period is not None]
     shape = "constant within an arc" if dominant == 0 else f"changes within {scale:.3g} s"
+    if periods and len(periods) == len(cells):
+        strongest = min(periods, key=lambda c: c.p_value)
+        scale = float(strongest.period or 0.0)
+        shape = f"repeats every {scale:.3g} s"
     value, noise, shown = _readable(excess, floor, unit)
     size = f"{value:.3g} {shown} RMS over {noise:.3g} {shown}"
     sentence = f"{channel.replace('_', ' ')}, {parts}, {where}: {size}; {shape}"

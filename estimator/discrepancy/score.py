@@ -152,7 +152,7 @@ def stack(problem: Problem, parts: Sequence[Linearization]) -> Stack:
 
 
 def signature(stacked: Stack, problem: Problem, parts: Sequence[Linearization], effect: EffectInstance,
-              setting: np.ndarray) -> Signature:
+              setting: np.ndarray, *, whole: bool = False) -> Signature:
     """The columns of one candidate, on the rows of ``stacked``.
 
     Args:
@@ -161,8 +161,9 @@ def signature(stacked: Stack, problem: Problem, parts: Sequence[Linearization], 
         parts: its linearizations with the candidate at ``setting``.
         effect: the candidate.
         setting: start values of the candidate's parameters.
+        whole: take the columns of the searched parameters too, which have a direction where the effect is not zero.
     """
-    ordinary = np.array([i for i, p in enumerate(effect.parameters) if p.search is None], dtype=int)
+    ordinary = np.array([i for i, p in enumerate(effect.parameters) if whole or p.search is None], dtype=int)
     unknown = problem.unknown(effect.name)
     typical = np.array([p.scale for p in effect.parameters]) / unknown.scales
     columns = np.zeros((len(stacked.residual), len(effect.parameters)))

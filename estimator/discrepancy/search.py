@@ -1,27 +1,29 @@
-"""The workflow: where is the gap, which effect is it, add it, prove it, until nothing is left to explain.
+"""The workflow: where is the gap, which effects are it, add them, prove them, until nothing is left to explain.
 
-Forward: score the whole library at the accepted fit, refit the few best jointly, and accept the one with the highest
-evidence if it is significant after the search and pays on held-out data. Backward: after each addition, effects that
-the others have made unnecessary leave, and each is compared with what could stand in its place, so that an early
-wrong choice does not lock the right one out. At the end, names that explain the data equally well form one group.
+At the accepted fit the whole library is one linear model of the residuals
+(:mod:`estimator.discrepancy.combinations`). The set of effects worth most in it is refitted jointly; at that fit the
+library is linearized again and the search goes on from there and from nothing, until no set is worth more than the
+accepted one. Effects may leave and be exchanged at every turn, so an early wrong choice locks nothing out. What stays
+must be significant after the search and pay on held-out data. At the end, names that explain the data equally well, by
+joint fits of their own, form one group.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from scipy.stats import chi2
 
+from estimator.discrepancy.combinations import Candidate, LinearLibrary, price, visible_directions
 from estimator.discrepancy.false_alarm import after_search, effective_looks
 from estimator.discrepancy.gap import Gap, find_gap
 from estimator.discrepancy.proof import HeldOut, channels_of, misfit, pays, shifts
 from estimator.discrepancy.score import Score, Signature, Stack, on_rows, scored, settings, signature, stack
 from estimator.discrepancy.subject import Subject
-from estimator.effects.declaration import EffectInstance
 from estimator.estimate import Estimate
 from estimator.problem import Problem
 from estimator.residuals import Linearization
@@ -29,9 +31,13 @@ from estimator.solvers.gauss_newton import Options, solve
 from estimator.solvers.summary import summarized
 
 SIGNIFICANT = 0.005  # probability of a name where there is nothing, after the search
-SHORTLIST = 6  # candidates that are refitted jointly
 MOST_EFFECTS = 6
 INDISTINGUISHABLE = 4.6  # log odds (100 to 1) below which two names explain the data equally well
+TRIED_SETTINGS = 6  # settings of a searched parameter that take part in sets
+RIVALS = 5  # names that are refitted in the place of an accepted one
+TURNS = 16  # sets that are refitted before the search stops
+REFUSALS = 4  # sets in a row that a joint fit did not bear out before the search stops
+LINEAR = 0.03  # part of a drop that the linear model may be wrong by
 
 Say = Callable[[str], None]
 
@@ -43,14 +49,12 @@ class Refit:
     Attributes:
         effects: their names.
         estimate: the fit.
-        cost: sum of the losses.
-        evidence: log odds against the plain model, with the declared sizes as priors.
+        cost: sum of the losses, each residual's over the square of the factor by which its noise exceeds the declared.
     """
 
     effects: tuple[str, ...]
     estimate: Estimate
     cost: float
-    evidence: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,20 +114,29 @@ class Findings:
     rejected: tuple[str, ...]
     looks: float
     seconds: float
-    correlation: Mapping[tuple[str, str], float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
 class _Round:
-    """The library scored at one accepted fit."""
+    """The library around one accepted fit.
+
+    Attributes:
+        fit: the accepted fit.
+        problem, parts, stacked: its problem with all candidates at zero, linearized; the fit's rows and columns.
+        table: score of every other effect beside the accepted ones.
+        gap: where model and data disagree.
+        library: the linear model of all effects, the accepted ones among them.
+        members: candidates of the library that stand for the accepted effects.
+    """
 
     fit: Refit
     problem: Problem
     parts: Sequence[Linearization]
     stacked: Stack
     table: tuple[Score, ...]
-    looks: float
     gap: Gap
+    library: LinearLibrary
+    members: tuple[int, ...]
 
 
 class Workflow:
@@ -133,10 +146,12 @@ class Workflow:
         self.subject = subject
         self.say = say or (lambda text: None)
         self.library = {e.name: e for e in subject.library}
+        self.looks = 1.0
         self._fits: dict[tuple[str, ...], Refit] = {}
         self._rounds: dict[tuple[str, ...], _Round] = {}
         self._searched: list[Signature] | None = None
-        self._looks: float | None = None
+        self._noise: dict[str, float] = {}
+        self._degrees: dict[str, int] = {}
 
     # ------------------------------------------------------------------------------------------------ fits
 
@@ -163,37 +178,35 @@ class Workflow:
                                   iterations=0, solver="gauss-newton", seconds=0.0)
         else:
             estimate = solve(problem, Options(tolerance=1e-3, iterations=60))
-        cost = float(sum(p.cost for p in estimate.parts))
-        plain = self._fits.get(())
-        evidence = 0.0 if plain is None else 0.5 * (plain.cost - cost) + self._occam(estimate, key)
-        fit = Refit(key, estimate, cost, evidence)
+        if not self._fits:
+            self._noise = dict(stack(estimate.problem, estimate.parts).scale)
+        cost = sum(p.cost / self._noise.get(r.name, 1.0) ** 2
+                   for r, p in zip(estimate.problem.residuals, estimate.parts, strict=True))
+        fit = Refit(key, estimate, float(cost))
         self._fits[key] = fit
         return fit
 
-    def _occam(self, estimate: Estimate, effects: Sequence[str]) -> float:
-        """Log of posterior over prior volume of the effects' parameters, and of the prior's density at their values."""
-        total = 0.0
-        for name in effects:
-            effect = self.library[name]
-            if all(u.name != name for u in estimate.unknowns):
-                continue
-            ordinary = [i for i, p in enumerate(effect.parameters) if p.search is None]
-            width, centre = prior_of(effect)
-            scaled = (estimate.covariance_of(name) / np.outer(width, width))[np.ix_(ordinary, ordinary)]
-            values = ((np.asarray(estimate.values[name]) - centre) / width)[ordinary]
-            # Directions that the data leave open have no posterior narrower than the prior and cost nothing.
-            eigenvalues, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))
-            seen = eigenvalues > 1e-20
-            total += 0.5 * float(np.sum(np.log(eigenvalues[seen] / (1 + eigenvalues[seen]))))
-            along = vectors[:, seen].T @ values
-            total -= 0.5 * float(np.sum(along**2 / (1 + eigenvalues[seen])))
-            total -= float(np.log(len(settings(effect))))  # the best of so many settings was taken
-        return total
+    def worth(self, fit: Refit) -> float:
+        """Half the drop of the sum of squares from the plain fit, less the prices of the effects.
 
-    # ------------------------------------------------------------------------------------------------ scores
+        A size that physics fixes was fitted to refute it: what its freedom gained is taken back.
+        """
+        total = 0.5 * (self.fit(()).cost - fit.cost)
+        for name in fit.effects:
+            effect = self.library[name]
+            total -= price(effect, self._degrees.get(name, len(effect.parameters)))
+            if all(u.name != name for u in fit.estimate.unknowns):
+                continue
+            values, sigma = fit.estimate.values[name], fit.estimate.sigma_of(name)
+            for p, v, s in zip(effect.parameters, values, sigma, strict=True):
+                if p.nominal is not None and np.isfinite(s) and s > 0:
+                    total -= 0.5 * ((float(v) - p.nominal) / float(s)) ** 2
+        return float(total)
+
+    # ------------------------------------------------------------------------------------------------ library
 
     def round(self, effects: Sequence[str]) -> _Round:
-        """Score every other effect of the library at the fit with ``effects``."""
+        """The whole library around the fit with ``effects``."""
         key = tuple(sorted(effects))
         if key in self._rounds:
             return self._rounds[key]
@@ -205,24 +218,74 @@ class Workflow:
         parts = problem.linearize(point)
         stacked = stack(problem, parts)
         present = {u.name for u in problem.unknowns}
-        signatures = [signature(stacked, problem, parts, self.library[n], np.zeros(len(self.library[n].parameters)))
+        base = stack(problem.holding(*(n for n in key if n in present)), parts) if key else stacked
+        signatures = [signature(base, problem, parts, self.library[n], np.zeros(len(self.library[n].parameters)))
                       for n in linear if n not in key and n in present]
-        signatures += [on_rows(s, stacked) for s in self.searched_signatures() if s.effect.name not in key]
-        widths = np.cumsum([0, *(s.columns.shape[1] for s in signatures)])
-        together = stacked.projected(np.concatenate([s.columns for s in signatures], axis=1))
-        projected = [together[:, a:b] for a, b in pairwise(widths)]
-        scores = [scored(stacked, s, p) for s, p in zip(signatures, projected, strict=True)]
-        if self._looks is None:
-            self.say("rate of false alarms")
-            self._looks = effective_looks(projected, [s.degrees for s in scores])
+        signatures += [on_rows(s, base) for s in self.searched_signatures()]
+        mine = [signature(base, problem, parts, self.library[n], np.asarray(point[n], dtype=float), whole=True)
+                for n in key if n in present]
+        library, members, projected, chosen = self._linear_model(base, stacked, signatures, mine)
+        own = np.linalg.qr(projected[-1])[0] if mine and projected[-1].size else np.zeros((len(base.residual), 0))
+        scores = [scored(stacked, signatures[i], projected[i] - own @ (own.T @ projected[i])) for i in chosen
+                  if signatures[i].effect.name not in key]
         best: dict[str, Score] = {}
         for s in scores:
             if s.name not in best or s.score > best[s.name].score:
                 best[s.name] = s
         table = tuple(sorted(best.values(), key=lambda s: -s.evidence))
-        result = _Round(fit, problem, parts, stacked, table, self._looks, find_gap(problem, stacked, parts))
+        result = _Round(fit, problem, parts, stacked, table, find_gap(problem, stacked, parts), library, members)
         self._rounds[key] = result
         return result
+
+    def _linear_model(self, base: Stack, stacked: Stack, signatures: Sequence[Signature], mine: Sequence[Signature],
+                      ) -> tuple[LinearLibrary, tuple[int, ...], list[np.ndarray], list[int]]:
+        """The linear library, the indices of the accepted effects in it, the projected columns of every signature
+        (and of all accepted effects, last), and the signatures whose setting takes part."""
+        everything = [*signatures, *mine]
+        widths = np.cumsum([0, *(s.columns.shape[1] for s in everything)])
+        raw = np.concatenate([s.columns for s in everything], axis=1)
+        together = base.projected(raw)
+        places = [slice(a, b) for a, b in pairwise(widths)]
+        bare = base.residual.copy()  # the residuals as they would be without the accepted effects
+        for s, place in zip(mine, places[len(signatures) :], strict=True):
+            ordinary = np.array([p.search is None for p in s.effect.parameters])
+            scales = np.array([p.scale for p in s.effect.parameters])
+            bare -= raw[:, place] @ np.where(ordinary, s.setting / scales, 0.0)
+        right = -(together.T @ bare)
+        now = -(together.T @ stacked.projected(stacked.residual))
+        blocks, strength = [], []
+        for s, place in zip(everything, places, strict=True):
+            matrix = together[:, place].T @ together[:, place]
+            seen = visible_directions(raw[:, place].T @ raw[:, place], matrix)
+            blocks.append(seen)
+            strength.append((float(np.sum((seen.T @ right[place]) ** 2)), float(np.sum((seen.T @ now[place]) ** 2))))
+            self._degrees[s.effect.name] = max(self._degrees.get(s.effect.name, 0), seen.shape[1])
+        if not self._rounds:
+            self.say("rate of false alarms")
+            self.looks = effective_looks([together[:, p] for p in places], [b.shape[1] for b in blocks])
+        chosen: set[int] = set()
+        for name in dict.fromkeys(s.effect.name for s in signatures):
+            own = [i for i, s in enumerate(signatures) if s.effect.name == name]
+            for k in (0, 1):
+                chosen |= set(sorted(own, key=lambda i: -strength[i][k])[:TRIED_SETTINGS])
+        kept = sorted(chosen) + list(range(len(signatures), len(everything)))
+        columns = np.concatenate([np.zeros(0, dtype=int), *(np.arange(places[i].start, places[i].stop) for i in kept)])
+        gram = together[:, columns].T @ together[:, columns]
+        candidates, start = [], 0
+        for i in kept:
+            s = everything[i]
+            width = s.columns.shape[1]
+            nominal = None
+            if any(p.nominal is not None for p in s.effect.parameters):
+                nominal = np.array([(s.effect.parameters[k].nominal or 0.0) / s.effect.parameters[k].scale
+                                    for k in s.ordinary])
+            candidates.append(Candidate(s.effect, s.setting, s.ordinary, np.arange(start, start + width), blocks[i],
+                                        nominal if blocks[i].shape[1] else None))
+            start += width
+        members = tuple(range(len(candidates) - len(mine), len(candidates)))
+        last = together[:, places[len(signatures)].start :] if mine else np.zeros((len(bare), 0))
+        projected = [together[:, p] for p in places[: len(signatures)]] + [last]
+        return LinearLibrary(candidates, gram, right[columns]), members, projected, sorted(chosen)
 
     def searched_signatures(self) -> list[Signature]:
         """Signatures of the effects with searched parameters, one per setting, taken once at the plain fit.
@@ -254,40 +317,133 @@ class Workflow:
         """Where the model with these effects and the data disagree."""
         return self.round(effects).gap
 
-    def start_of(self, score: Score, fit: Refit) -> dict[str, np.ndarray]:
-        """Start values of a refit: the accepted fit, and for a searched effect the best setting that was tried."""
-        start = dict(fit.estimate.values)
-        if any(p.search for p in self.library[score.name].parameters):
-            start[score.name] = score.setting
+    def start_of(self, here: _Round, chosen: Sequence[int]) -> dict[str, np.ndarray]:
+        """Start values of a refit: the accepted fit, newcomers at the size that the linear model expects."""
+        start = {n: np.asarray(v) for n, v in here.fit.estimate.values.items()}
+        for i, size in zip(chosen, here.library.explained(chosen).sizes, strict=True):
+            effect = here.library.candidates[i].effect
+            if effect.name in here.fit.effects:
+                continue
+            low = np.array([p.plausible[0] for p in effect.parameters])
+            high = np.array([p.plausible[1] for p in effect.parameters])
+            searched = np.array([p.search is not None for p in effect.parameters])
+            start[effect.name] = np.where(searched, here.library.candidates[i].setting, np.clip(size, low, high))
         return start
 
     # ------------------------------------------------------------------------------------------------ search
 
-    def best_addition(self, effects: tuple[str, ...], excluded: set[str]) -> tuple[Score, Refit, float] | None:
-        """The significant candidate with the highest evidence after a joint refit, or None."""
+    def significant(self, drop: float, name: str) -> float:
+        """Probability after the search that noise lowers the sum of squares by ``drop`` through this effect."""
+        degrees = max(self._degrees.get(name, 1), 1)
+        return after_search(float(chi2.sf(max(drop, 0.0), degrees)), self.looks)
+
+    def pruned(self, here: _Round, chosen: Sequence[int]) -> list[int]:
+        """The set without what is not significant beside the rest, the weakest leaving first.
+
+        A newcomer whose part is below the error of the linear model is left for the turn after the refit.
+        """
+        library = here.library
+        current = list(chosen)
+        doubt = LINEAR * max(library.explained(current).drop - library.explained(here.members).drop, 0.0)
+        while current:
+            whole = library.explained(current).drop
+            losses = []
+            for i in current:
+                drop = whole - library.explained([j for j in current if j != i]).drop
+                name = library.candidates[i].name
+                known = name in here.fit.effects or len(current) == 1
+                losses.append((self.significant(drop if known else drop - doubt, name), i))
+            worst, index = max(losses)
+            if worst < SIGNIFICANT:
+                break
+            current.remove(index)
+        return current
+
+    def best_set(self, accepted: tuple[str, ...], excluded: Collection[str]) -> tuple[str, ...]:
+        """The set of effects worth most, reached from ``accepted`` by joint refits."""
+        refused: set[frozenset[str]] = set()
+        in_a_row = 0
+        for _ in range(TURNS):
+            here = self.round(accepted)
+            library = here.library
+            chosen = self.pruned(here, library.best(here.members, excluded, MOST_EFFECTS, refused))
+            names = frozenset(library.candidates[i].name for i in chosen)
+            if names == set(accepted) or names in refused or in_a_row == REFUSALS:
+                return accepted
+            self.say("joint fit with " + (", ".join(sorted(names)) or "nothing"))
+            refit = self.fit(sorted(names), self.start_of(here, chosen))
+            sound = all(self.plausible(n, refit) for n in names)
+            if sound and self.worth(refit) > self.worth(here.fit) + 1e-3:
+                accepted, in_a_row = refit.effects, 0
+            else:
+                refused.add(names)
+                in_a_row += 1
+        return accepted
+
+    def needed(self, effects: tuple[str, ...]) -> tuple[str, ...]:
+        """The effects without those that are not significant beside the others, by joint fits."""
+        current = effects
+        while current:
+            losses = [(self.loss(current, name)[1], name) for name in current]
+            worst, name = max(losses)
+            if worst < SIGNIFICANT:
+                break
+            self.say(f"{name} is not needed")
+            current = tuple(n for n in current if n != name)
+        return current
+
+    def loss(self, effects: Sequence[str], name: str) -> tuple[float, float]:
+        """Rise of the sum of squares without one of the effects, and how probable that is by noise after the search."""
+        full = self.fit(effects)
+        without = self.fit([n for n in effects if n != name], full.estimate.values)
+        drop = without.cost - full.cost
+        return drop, self.significant(drop, name)
+
+    def rivals(self, effects: tuple[str, ...], name: str, excluded: Collection[str]) -> list[tuple[str, Refit]]:
+        """Joint fits with another effect in the place of ``name``, of all that could be worth as much."""
         here = self.round(effects)
-        open_ = [s for s in here.table if s.degrees > 0 and s.name not in excluded]
-        significant = [s for s in open_ if after_search(s.p_value, here.looks) < SIGNIFICANT]
-        if not significant:
-            return None
-        fitted = []
-        best_gain = -np.inf
-        for s in significant[:SHORTLIST]:
-            if s.evidence < best_gain - 10 * INDISTINGUISHABLE:
-                break  # its linear drop cannot catch up with a joint fit that is made
-            self.say(f"refit with {s.name}")
-            refit = self.fit((*effects, s.name), self.start_of(s, here.fit))
-            sound = self.plausible(s.name, refit)
-            fitted.append((refit.evidence if sound else refit.evidence - 1e9, s, refit))
-            if sound:
-                best_gain = max(best_gain, refit.evidence - here.fit.evidence)
-        fitted.sort(key=lambda item: -item[0])
-        for _, s, refit in fitted:
-            drop = here.fit.cost - refit.cost
-            p = after_search(float(chi2.sf(max(drop, 0.0), max(s.degrees, 1))), here.looks)
-            if p < SIGNIFICANT and self.plausible(s.name, refit):
-                return s, refit, p
-        return None
+        library = here.library
+        rest = [i for i in here.members if library.candidates[i].name != name]
+        full, without = library.explained(here.members), library.explained(rest)
+        room = 3 * INDISTINGUISHABLE + 0.05 * (full.drop - without.drop)
+        found = []
+        for other in library.names():
+            if other in effects or other in excluded:
+                continue
+            i = library.best_setting(rest, other)
+            assert i is not None
+            tried = library.explained([*rest, i])
+            if tried.plausible and tried.worth > full.worth - room and \
+                    self.significant(tried.drop - without.drop, other) < SIGNIFICANT:
+                found.append((tried.worth, other, i))
+        fits = []
+        for _, other, i in sorted(found, reverse=True)[:RIVALS]:
+            self.say(f"{other} in place of {name}?")
+            refit = self.fit([*(n for n in effects if n != name), other], self.start_of(here, [*rest, i]))
+            if self.plausible(other, refit):
+                fits.append((other, refit))
+        return fits
+
+    def exchanged(self, effects: tuple[str, ...], excluded: Collection[str]) -> tuple[str, ...]:
+        """The effects with one of them exchanged where a joint fit shows that another is worth more."""
+        best, worth = effects, self.worth(self.fit(effects))
+        for name in effects:
+            for _, refit in self.rivals(effects, name, excluded):
+                if self.worth(refit) > worth + 1e-3:
+                    best, worth = refit.effects, self.worth(refit)
+        return best
+
+    def group(self, effects: tuple[str, ...], name: str, excluded: Collection[str] = ()) -> tuple[str, ...]:
+        """Names that explain the data as well as ``name`` beside the other effects, no richer than it."""
+        worth = self.worth(self.fit(effects))
+        degrees = self._degrees.get(name, 1)
+        without = self.fit([n for n in effects if n != name])
+        alike = [name]
+        for other, refit in self.rivals(effects, name, excluded):
+            if self._degrees.get(other, 1) <= degrees and self.worth(refit) > worth - INDISTINGUISHABLE and \
+                    self.significant(without.cost - refit.cost, other) < SIGNIFICANT:
+                alike.append(other)
+        return tuple(alike)
 
     def plausible(self, name: str, refit: Refit) -> bool:
         """Whether the fitted size agrees with what the physics demands and an engineer would believe."""
@@ -305,98 +461,34 @@ class Workflow:
                 return False
         return True
 
-    def needed(self, effects: tuple[str, ...]) -> tuple[str, ...]:
-        """The effects without those that the others have made unnecessary."""
-        current = effects
-        while len(current) > 1:
-            full = self.fit(current)
-            losses = []
-            for name in current:
-                rest = tuple(n for n in current if n != name)
-                without = self.fit(rest, full.estimate.values)
-                looks = self.round(rest).looks if rest in self._rounds else 30.0
-                degrees = len([p for p in self.library[name].parameters if p.search is None])
-                losses.append((after_search(float(chi2.sf(max(without.cost - full.cost, 0.0), degrees)), looks), name))
-            worst, name = max(losses)
-            if worst < SIGNIFICANT:
-                break
-            self.say(f"{name} is no longer needed")
-            current = tuple(n for n in current if n != name)
-        return current
-
-    def swapped(self, effects: tuple[str, ...], excluded: set[str]) -> tuple[str, ...]:
-        """The effects with one of them exchanged, where that explains the data better."""
-        best = self.fit(effects)
-        for name in effects:
-            rest = tuple(n for n in effects if n != name)
-            here = self.round(rest)
-            mine = next((s for s in here.table if s.name == name), None)
-            for s in [t for t in here.table if t.name not in (*rest, *excluded, name) and t.degrees > 0][:3]:
-                if after_search(s.p_value, here.looks) >= SIGNIFICANT or (mine and _hopeless(s, mine)):
-                    continue
-                self.say(f"{s.name} in place of {name}?")
-                other = self.fit((*rest, s.name), self.start_of(s, here.fit))
-                if other.evidence > best.evidence + INDISTINGUISHABLE and self.plausible(s.name, other):
-                    self.say(f"{s.name} in place of {name}")
-                    best = other
-        return best.effects
-
-    def group(self, effects: tuple[str, ...], name: str) -> tuple[str, ...]:
-        """Names that explain the data as well as ``name`` beside the other effects."""
-        rest = tuple(n for n in effects if n != name)
-        here = self.round(rest)
-        reference = self.fit(effects).evidence
-        alike = [name]
-        mine = next((s for s in here.table if s.name == name), None)
-        if mine is None:
-            return (name,)
-        for s in here.table:
-            if s.name == name or s.degrees == 0 or s.score < 0.5 * mine.score - 20:
-                continue
-            if _hopeless(s, mine):
-                continue
-            self.say(f"{s.name} beside {name}?")
-            other = self.fit((*rest, s.name), self.start_of(s, here.fit))
-            if other.evidence > reference - INDISTINGUISHABLE and self.plausible(s.name, other):
-                alike.append(s.name)
-        return tuple(alike)
-
     def run(self) -> Findings:
         """Search, add, step back, prove; see :class:`Findings`."""
         began = time.perf_counter()
         self.say("fit of the plain model")
         self.fit(())
-        self.say("scores of the library")
+        self.say("signatures of the library")
         before = self.gap(())
         accepted: tuple[str, ...] = ()
         excluded: set[str] = set()
-        order: list[str] = []
-        p_values: dict[str, float] = {}
-        tables = []
-        while len(accepted) < MOST_EFFECTS:
-            self.say(f"search with {len(accepted)} effects in the model")
-            tables.append(self.round(accepted).table)
-            found = self.best_addition(accepted, excluded)
-            if found is None:
+        tables = [self.round(()).table]
+        for _ in range(TURNS):
+            at_entry = accepted
+            accepted = self.needed(self.best_set(accepted, excluded))
+            accepted = self.needed(self.exchanged(accepted, excluded))
+            ordered = self.ordered(accepted)
+            unpaid = next((n for k, n in enumerate(ordered) if not self._pays(ordered[:k], ordered[: k + 1], n)), None)
+            if unpaid is not None:
+                self.say(f"{unpaid} does not pay on held-out data")
+                excluded.add(unpaid)
+                accepted = tuple(n for n in accepted if n != unpaid)
+            elif set(accepted) == set(at_entry):
                 break
-            score, refit, p = found
-            if not self._pays(accepted, refit.effects, score.name):
-                excluded.add(score.name)
-                continue
-            accepted = self.needed((*accepted, score.name))
-            order.append(score.name)
-            p_values[score.name] = p
-            if len(accepted) > 1:
-                exchanged = self.swapped(accepted, excluded)
-                if set(exchanged) != set(accepted):
-                    for newcomer in set(exchanged) - set(accepted):
-                        order.append(newcomer)
-                        p_values[newcomer] = p
-                    accepted = self.needed(exchanged)
-        ordered = tuple(n for n in dict.fromkeys(order) if n in accepted)
-        findings = self._findings(ordered, p_values)
+        ordered = self.ordered(accepted)
+        tables += [self._rounds[key].table for key in (tuple(sorted(ordered[: k + 1])) for k in range(len(ordered)))
+                   if key in self._rounds]
+        findings = self._findings(ordered, excluded)
         after = self.gap(accepted)
-        self.say("joint refit of all data")
+        self.say("joint fit of all data")
         plain = solve(self.subject.problem((), (), hold_out=False))
         final = plain
         if accepted:
@@ -407,32 +499,41 @@ class Workflow:
             final = solve(problem.starting_at(usable))
         verdict, why = _verdict(findings, before, after)
         return Findings(verdict, why, before, after, findings, tuple(tables), plain, final, tuple(sorted(excluded)),
-                        self.round(()).looks, time.perf_counter() - began)
+                        self.looks, time.perf_counter() - began)
+
+    def ordered(self, effects: Collection[str]) -> tuple[str, ...]:
+        """The effects: the one that explains most by itself, then the one that explains most beside it, and so on."""
+        if len(effects) < 2:
+            return tuple(effects)
+        here = self.round(tuple(effects))
+        left = list(here.members)
+        order: list[int] = []
+        while left:
+            best = max(left, key=lambda i: here.library.explained([*order, i]).drop)
+            order.append(best)
+            left.remove(best)
+        return tuple(here.library.candidates[i].name for i in order)
 
     def _pays(self, before: Sequence[str], after: Sequence[str], name: str) -> bool:
-        first, second = self.fit(before).estimate, self.fit(after).estimate
+        second = self.fit(after).estimate
+        first = self.fit(before, second.values).estimate
         return pays(first.problem, first.parts, second.problem, second.parts, channels_of(second.problem, name))
 
-    def _findings(self, order: tuple[str, ...], p_values: Mapping[str, float]) -> tuple[Finding, ...]:
+    def _findings(self, order: tuple[str, ...], excluded: Collection[str]) -> tuple[Finding, ...]:
         findings = []
         for k, name in enumerate(order):
-            first, second = self.fit(order[:k]), self.fit(order[: k + 1])
-            rest = tuple(n for n in order if n != name)
             self.say(f"what explains the data as well as {name}")
-            expected = next(s for s in self.round(order[:k]).table if s.name == name)
+            second = self.fit(order[: k + 1])
+            first = self.fit(order[:k], second.estimate.values)
+            expected = next((s for s in self.round(order[:k]).table if s.name == name), None)
+            assert expected is not None
             one, two = first.estimate, second.estimate
-            degrees = len([p for p in self.library[name].parameters if p.search is None])
             findings.append(Finding(
-                name, self.group(order, name) if rest is not None else (name,), first.cost - second.cost, degrees,
-                p_values.get(name, 0.0), misfit(one.problem, one.parts, held_out=False),
+                name, self.group(order, name, excluded), first.cost - second.cost, self._degrees.get(name, 1),
+                self.loss(order, name)[1], misfit(one.problem, one.parts, held_out=False),
                 misfit(two.problem, two.parts, held_out=False), misfit(one.problem, one.parts, held_out=True),
                 misfit(two.problem, two.parts, held_out=True), expected, shifts(one, two)))
         return tuple(findings)
-
-
-def _hopeless(candidate: Score, reference: Score) -> bool:
-    """Whether a joint refit cannot be expected to lift ``candidate`` to ``reference``; big gaps get more benefit."""
-    return candidate.evidence < reference.evidence - 3 * INDISTINGUISHABLE - 0.05 * reference.score
 
 
 def _polished(problem: Problem, names: set[str]) -> dict[str, np.ndarray]:
@@ -448,22 +549,6 @@ def _polished(problem: Problem, names: set[str]) -> dict[str, np.ndarray]:
     part = problem.with_residuals(touched).holding(*(free - reached))
     estimate = solve(part, Options(tolerance=3e-2, iterations=12, largest_step=1e4))
     return dict(estimate.values)
-
-
-def prior_of(effect: EffectInstance) -> tuple[np.ndarray, np.ndarray]:
-    """Prior sigma and centre of each parameter, in its unit."""
-    width, centre = [], []
-    for p in effect.parameters:
-        if p.search is not None:
-            width.append(0.3 * (p.search[1] - p.search[0]))
-            centre.append(0.5 * (p.search[0] + p.search[1]))
-        elif p.nominal is not None:
-            width.append(0.02 * abs(p.nominal))
-            centre.append(p.nominal)
-        else:
-            width.append(3 * p.scale)
-            centre.append(0.0)
-    return np.array(width), np.array(centre)
 
 
 def _verdict(findings: Sequence[Finding], before: Gap, after: Gap) -> tuple[str, str]:

@@ -525,7 +525,8 @@ def _positions(model: AlignmentModel, effects: tuple[EffectInstance, ...]) -> Tr
             arcs |= (gnss.time >= arc.start - 1e-6) & (gnss.time <= arc.stop + 1e-6)
         data = {"environment": model.environment(gnss.time), "attitude": quaternion, "rate": rate,
                 "inside_arc": inside * arcs}
-    return TrajectoryResidual("gnss", "gnss", "m", trajectory_unknown(directions), model.block, directions, gnss.time,
+    trajectory = trajectory_unknown(directions, displaced=kernel is not None)
+    return TrajectoryResidual("gnss", "gnss", "m", trajectory, model.block, directions, gnss.time,
                               gnss.position, model.position_weights,
                               np.broadcast_to(gnss.standard_deviation, gnss.position.shape), kernel, data)
 
