@@ -17,6 +17,7 @@ from estimator.estimate import Estimate
 from estimator.problem import Problem
 from estimator.residuals import KernelResidual
 from problems.geo_orbit.effects import OrbitEffect, instances
+from problems.geo_orbit.kept_orbit import KeptExplanation, explained_kept
 from problems.geo_orbit.problem import OrbitModel, orbit_model, orbit_problem
 from problems.geo_orbit.settings import OrbitSettings
 from problems.geo_orbit.solution import solve_from_far
@@ -190,8 +191,11 @@ def explained(
     hold_out: float = 0.2,
     without: Sequence[str] = (),
     say: Say | None = None,
-) -> OrbitExplanation:
+) -> OrbitExplanation | KeptExplanation:
     """Find what the model of the settings misses in tracking data.
+
+    Where the data are long enough to hold manoeuvres of a satellite that is kept on station, these are looked for first
+    (:mod:`problems.geo_orbit.kept_orbit`); with none in the data the generic workflow does the rest.
 
     Args:
         tracking: the observations.
@@ -205,6 +209,9 @@ def explained(
     """
     began = time.perf_counter()
     model = orbit_model(tracking, settings)
+    kept = explained_kept(model, hold_out=hold_out, without=without, say=say)
+    if kept is not None:
+        return kept
     plain = solve_from_far(orbit_problem(model), model)
     model = replace(model, position=plain.values["position"], velocity=plain.values["velocity"])
     subject = OrbitSubject(model, hold_out, tuple(without))

@@ -1,0 +1,517 @@
+"""What separates the tracking of a satellite that is kept on station from the model of its orbit.
+
+Manoeuvres first (:mod:`problems.geo_orbit.manoeuvres`), because nothing of metres can be seen before them; then every
+other effect of the library at the joint fit of one orbit, all manoeuvres and the calibration. Each effect is proved by
+taking it away again, all others refitted: by how much the fitted data, and the passes that no fit has seen, miss the
+orbit without it and with it. These refits are made to first order about the joint fit.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from estimator.models.earth_orientation import utc_text
+from estimator.models.errors import InputError
+from estimator.problem import Problem
+from estimator.residuals import KernelResidual
+from problems.geo_orbit.effects import OrbitEffect, chosen, instances
+from problems.geo_orbit.manoeuvres import (
+    FAMILY,
+    LEVEL,
+    Fit,
+    Found,
+    Prior,
+    Search,
+    common_error,
+    gauss_newton,
+)
+from problems.geo_orbit.problem import OrbitModel, orbit_model, orbit_problem
+from problems.geo_orbit.settings import OrbitSettings
+from problems.geo_orbit.tracking import Tracking
+
+Say = Callable[[str], None]
+
+_PARAMETER = 3.986004418e14  # m3/s2 of the Earth
+_SHORTEST_SPAN = 3.0  # revolutions that the search for manoeuvres asks for
+_OFTEN = 6.0  # instants of measurement in a revolution that it asks for
+_BLOCKS = 8  # held-out passes are so many to a revolution
+_MOST = 6  # effects beside calibration and manoeuvres
+_UNDETERMINED = 0.5  # posterior over prior sigma beyond which the data say nothing of a number
+
+
+def period_of(state: np.ndarray) -> float:
+    """Period of the orbit of a state (6,), s; NaN where it is not closed."""
+    r, v = float(np.linalg.norm(state[:3])), float(np.linalg.norm(state[3:]))
+    a = 1 / (2 / r - v**2 / _PARAMETER)
+    return float(2 * np.pi * np.sqrt(a**3 / _PARAMETER)) if a > 0 else float("nan")
+
+
+def calibration(model: OrbitModel, without: Sequence[str] = ()) -> tuple[OrbitEffect, ...]:
+    """Effects that the search for manoeuvres must not mistake for one: biases, scale, the two parts of sunlight."""
+    layout = model.layout
+    offered = {e.name: e for e in instances(layout) if e.name not in without and e.family not in without}
+    names = ["range-scale-error", "solar-radiation-pressure", "solar-radiation-pressure:oblique"]
+    names.append("range-bias:each" if "range-bias:each" in offered else "range-bias")
+    for station, kinds in layout.stations:
+        if set(kinds) & {"azimuth_elevation", "direction_cosines"}:
+            names.append(f"angle-bias:{station}")
+        if "range_rate" in kinds:
+            names.append(f"range-rate-bias:{station}")
+    return tuple(offered[n] for n in dict.fromkeys(names) if n in offered)
+
+
+_WIDTHS = {"range-bias": 1e4, "range-scale-error": 1e-3, "angle-bias": 0.01, "range-rate-bias": 1.0}  # m, 1, rad, m/s
+
+
+def _priors(effects: Sequence[OrbitEffect], problem: Problem) -> tuple[Prior, ...]:
+    found = []
+    for e in effects:
+        width = np.array([_WIDTHS.get(e.family, p.scale) for p in e.parameters])
+        found.append(Prior.of(e.name, np.zeros(len(width)), width))
+    for u in problem.unknowns:
+        if u.name not in ("position", "velocity") and all(u.name != e.name for e in effects):
+            found.append(Prior.of(u.name, problem.start[u.name], np.broadcast_to(u.scales, u.manifold.tangent)))
+    return tuple(found)
+
+
+@dataclass(frozen=True, eq=False)
+class _Proof:
+    """What is lost when an effect is taken away and all others are refitted to first order.
+
+    Attributes:
+        score: drop of the sum of squares over the measured noise.
+        p_value: after the search, with errors that measurements share taken into account.
+        fitted, held_out: root mean square (m or the channel's unit) by channel, without and with the effect.
+        ratio: the same over the declared noise: fitted without, with; held out without, with.
+    """
+
+    score: float
+    p_value: float
+    fitted: dict[str, tuple[float, float]]
+    held_out: dict[str, tuple[float, float]]
+    ratio: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class KeptEffect:
+    """One effect in the model of a kept satellite.
+
+    Attributes:
+        name, group: as in the library; a manoeuvre has its number.
+        parameters: value, sigma, unit by name.
+        proof: what is lost without it.
+        utc: time of a manoeuvre; "" for others.
+        reference: where the formula comes from.
+    """
+
+    name: str
+    group: tuple[str, ...]
+    parameters: dict[str, dict[str, Any]]
+    proof: _Proof
+    utc: str
+    reference: str
+
+
+@dataclass(frozen=True, eq=False)
+class KeptExplanation:
+    """The answer for a kept satellite.
+
+    Attributes:
+        model: the data; found: the search; fit: the joint fit with every effect; plain: one orbit without any.
+        effects: largest first.
+        undetermined: numbers of the calibration that the data leave open, in words.
+        rms: root mean square by channel of the fitted and the held-out data, before and after everything.
+    """
+
+    model: OrbitModel
+    found: Found
+    fit: Fit
+    plain: Fit
+    before: dict[str, tuple[float, float, str]]
+    after: dict[str, tuple[float, float, str]]
+    structure: float
+    effects: tuple[KeptEffect, ...]
+    undetermined: tuple[str, ...]
+    verdict: str
+    why: str
+    seconds: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """The machine-readable answer of ``boresight orbit explain``."""
+        stations = [r.name for r in self.fit.problem.residuals]
+        return {
+            "verdict": self.verdict,
+            "why": self.why,
+            "where": [
+                {
+                    "channel": channel,
+                    "arcs": stations,
+                    "time_scale_s": self.found.search.period,
+                    "unit": unit,
+                    "excess": fitted,
+                    "sentence": f"{channel}, every station: {fitted:.4g} {unit} RMS about one orbit without manoeuvres",
+                }
+                for channel, (fitted, _, unit) in self.before.items()
+            ],
+            "effects": [_entry(e) for e in self.effects],
+            "next_measurement": self.next_measurement,
+            "left": [
+                {"channel": c, "rms": fitted, "held_out_rms": held, "unit": unit, "common_error": self.structure}
+                for c, (fitted, held, unit) in self.after.items()
+            ],
+            "undetermined": list(self.undetermined),
+            "manoeuvres": len(self.found.names),
+            "seconds": self.seconds,
+        }
+
+    @property
+    def next_measurement(self) -> str:
+        """What would separate what these data cannot."""
+        if self.undetermined:
+            return (
+                "ranges from a station on another continent, or angles, over one revolution, to separate "
+                + ", ".join(self.undetermined)
+            )
+        return "" if self.verdict == "named" else "ranges more often than the burns last, around their times"
+
+    def __str__(self) -> str:
+        lines = [f"{self.verdict}: {self.why}", ""]
+        lines += [f"where: {w['sentence']}" for w in self.as_dict()["where"]]
+        header = f"{'effect':<36}{'time (UTC)':<22}{'size':>34}{'held out':>22}"
+        lines += ["", header]
+        for e in self.effects:
+            size = ", ".join(f"{p['value']:.4g} +- {p['sigma']:.1g} {p['unit']}" for n, p in e.parameters.items()
+                             if n != "time")
+            held = "; ".join(f"{a:.4g} -> {b:.4g}" for a, b in e.proof.held_out.values())
+            lines.append(f"{e.name:<36}{e.utc[:19]:<22}{size}   {held}")
+        lines += ["", *(f"left in {c}: {a:.3g} {u} RMS, held out {b:.3g} {u}" for c, (a, b, u) in self.after.items())]
+        if self.undetermined:
+            lines.append("not determined by these data: " + ", ".join(self.undetermined))
+        return "\n".join(lines)
+
+
+def _entry(e: KeptEffect) -> dict[str, Any]:
+    entry = {
+        "name": e.name,
+        "group": list(e.group),
+        "parameters": e.parameters,
+        "score": e.proof.score,
+        "p_value_after_search": e.proof.p_value,
+        "gap_before": e.proof.ratio[0],
+        "gap_after": e.proof.ratio[1],
+        "held_out_before": e.proof.ratio[2],
+        "held_out_after": e.proof.ratio[3],
+        "fitted": {c: {"before": a, "after": b} for c, (a, b) in e.proof.fitted.items()},
+        "held_out": {c: {"before": a, "after": b} for c, (a, b) in e.proof.held_out.items()},
+        "reference": e.reference,
+    }
+    if e.utc:
+        entry["time_utc"] = e.utc
+    return entry
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Rows of a fit over the declared noise, fitted ones and held-out ones, with their channels."""
+
+    residual: np.ndarray
+    jacobian: np.ndarray
+    channel: np.ndarray
+    sigma: np.ndarray
+
+
+def _rows(fit: Fit, noise: dict[str, float], *, held_out: bool) -> _Rows:
+    residuals = []
+    for r in fit.problem.residuals:
+        assert isinstance(r, KernelResidual)
+        mask = np.ones(r.samples, dtype=bool) if r.accepted is None else np.array(r.accepted)
+        residuals.append(replace(r, accepted=~mask if held_out else mask))
+    again = gauss_newton(fit.problem.with_residuals(residuals), fit.values, (), noise, iterations=0)
+    channel, sigma = [], []
+    for r in residuals:
+        kept = np.repeat(np.asarray(r.accepted), r.kernel.size)
+        channel += [r.channel] * int(kept.sum())
+        sigma.append(r.standard_deviation.ravel()[kept])
+    return _Rows(again.residual, again.jacobian, np.array(channel), np.concatenate(sigma))
+
+
+def _misfit(rows: _Rows, change: np.ndarray, noise: dict[str, float]) -> tuple[dict[str, float], float]:
+    """RMS by channel in its unit, and over the declared noise in all, of rows moved by a step of the parameters."""
+    factor = np.array([noise.get(c, 1.0) for c in rows.channel])
+    whitened = (rows.residual + rows.jacobian @ change) * factor
+    by_channel = {str(c): float(np.sqrt(np.mean((whitened * rows.sigma)[rows.channel == c] ** 2)))
+                  for c in dict.fromkeys(rows.channel)}
+    return by_channel, float(np.sqrt(np.mean(whitened**2))) if len(whitened) else 0.0
+
+
+def explained_kept(model: OrbitModel, *, hold_out: float = 0.2, without: Sequence[str] = (),
+                   say: Say | None = None) -> KeptExplanation | None:
+    """Manoeuvres and other effects in the tracking of a kept satellite; None where there is no manoeuvre to find.
+
+    Args:
+        model: the prepared data with a state near the orbit.
+        hold_out: fraction of the data that no fit sees, in whole passes of an eighth of a revolution.
+        without: effects that are taken out of the library.
+        say: called with what is being done.
+    """
+    began = time.perf_counter()
+    say = say or (lambda text: None)
+    state = np.concatenate([model.position, model.velocity])
+    period = period_of(state)
+    first, last = model.span
+    instants = np.unique(np.concatenate([np.round(model.seconds(o.time)) for o in model.tracking.observations]))
+    often = len(instants) / max((last - first) / period, 1.0) if np.isfinite(period) else 0.0
+    if often < _OFTEN or last - first < _SHORTEST_SPAN * period or FAMILY in without:
+        return None
+    model = replace(model, finite_burns=True)
+    effects = calibration(model, without)
+    problem = _with_held_out(orbit_problem(model, [e.name for e in effects]), period, hold_out)
+    search = Search(problem, _priors(effects, problem), period, say)
+    try:
+        found = search.run(state, 0.0)
+    except InputError:
+        return None
+    if not found.names:
+        return None
+    return _concluded(model, found, effects, without, say, began)
+
+
+def _with_held_out(problem: Problem, period: float, hold_out: float) -> Problem:
+    """The problem with whole passes kept from every fit, those of all stations at the same times."""
+    every = max(2, round(1 / hold_out))
+    residuals = []
+    for r in problem.residuals:
+        assert isinstance(r, KernelResidual)
+        residuals.append(replace(r, accepted=np.floor(r.time / (period / _BLOCKS)).astype(int) % every != every // 2))
+    return problem.with_residuals(residuals)
+
+
+def _with_manoeuvres(model: OrbitModel, found: Found, effects: Sequence[str], candidates: Sequence[str],
+                     values: dict[str, np.ndarray]) -> tuple[Problem, dict[str, np.ndarray]]:
+    """The joint problem with the found manoeuvres and further effects, and a point near its optimum."""
+    residuals = {r.name: r for r in found.search.problem.residuals if isinstance(r, KernelResidual)}
+    base = orbit_problem(model, effects, candidates=candidates)
+    same = [replace(r, accepted=residuals[r.name].accepted) for r in base.residuals if isinstance(r, KernelResidual)]
+    search = replace(found.search, problem=base.with_residuals(same))
+    steps = dict(zip(found.names, found.manoeuvres, strict=True))
+    first, last = model.span
+    problem, _ = search.stretch(first, last, found.arc.start, steps, everything=True)
+    point = {**problem.start, **{n: v for n, v in values.items() if n in problem.start}}
+    return problem.freeing(*candidates), point
+
+
+def _further(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], without: Sequence[str],
+             say: Say) -> list[str]:
+    """Names of other effects of the library that the joint fit still misses, best first."""
+    fit, noise = found.fit, found.noise
+    covered = {"range-bias", FAMILY, *(e.family for e in own if e.family in ("angle-bias", "range-rate-bias"))}
+    offered = [e for e in instances(model.layout) if e.family not in covered and e not in own
+               and e.name not in without and e.family not in without]
+    if not offered:
+        return []
+    say("scores of the library")
+    problem, point = _with_manoeuvres(model, found, [e.name for e in own], [e.name for e in offered], fit.values)
+    wide = gauss_newton(problem, point, found.search.priors, noise, iterations=0)
+    ours = np.concatenate([np.arange(wide.jacobian.shape[1])[wide.columns(u.name)] for u in fit.unknowns])
+    held = _rows(wide, noise, held_out=True)
+    chosen_: list[str] = []
+    columns = list(ours)
+    level = max(1.0, fit.square / fit.degrees) * found.shared
+    while len(chosen_) < _MOST:
+        prior = np.vstack([wide.prior[:, columns], 1e-9 * np.eye(len(columns))])
+        basis, upper = np.linalg.qr(np.vstack([wide.jacobian[:, columns], prior]))
+        inner = basis[: wide.rows]
+        off = np.concatenate([wide.off, np.zeros(len(columns))])
+        everything = np.concatenate([wide.residual, off])
+        left = (everything - basis @ (basis.T @ everything))[: wide.rows]
+        best: tuple[float, str, list[int]] | None = None
+        for e in offered:
+            if e.name in chosen_:
+                continue
+            own_columns = list(np.arange(wide.jacobian.shape[1])[wide.columns(e.name)])
+            block = wide.jacobian[:, own_columns]
+            cross = inner.T @ block
+            full = block.T @ block
+            size = np.sqrt(np.maximum(np.diag(full), 1e-300))
+            values, vectors = np.linalg.eigh((full - cross.T @ cross) / np.outer(size, size))
+            seen = values > 1e-8
+            if not seen.any():
+                continue
+            amounts = vectors[:, seen].T @ (block.T @ left / size)
+            step = -(vectors[:, seen] @ (amounts / values[seen])) / size
+            gain = float(np.sum(amounts**2 / values[seen]))
+            if chi2.sf(gain / level, int(seen.sum())) * len(offered) > LEVEL:
+                continue
+            sizes = step * wide.scales[own_columns]
+            if any(not p.plausible[0] <= v <= p.plausible[1] for p, v in zip(e.parameters, sizes, strict=True)):
+                continue
+            change = np.zeros(wide.jacobian.shape[1])
+            change[own_columns] = step
+            change[columns] = -np.linalg.solve(upper, basis.T @ (everything + np.concatenate(
+                [block @ step, np.zeros(len(everything) - wide.rows)])))
+            rest = np.zeros_like(change)
+            rest[columns] = -np.linalg.solve(upper, basis.T @ everything)
+            if held.residual.size and np.median(np.abs(held.residual + held.jacobian @ change)) > np.median(
+                    np.abs(held.residual + held.jacobian @ rest)):
+                continue
+            if best is None or gain > best[0]:
+                best = (gain, e.name, own_columns)
+        if best is None:
+            break
+        chosen_.append(best[1])
+        columns += best[2]
+    return chosen_
+
+
+def _concluded(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], without: Sequence[str], say: Say,
+               began: float) -> KeptExplanation:
+    further = _further(model, found, own, without, say)
+    every = (*own, *chosen(model.layout, further))
+    say("joint fit with " + (", ".join(further) or "nothing further"))
+    problem, point = _with_manoeuvres(model, found, [e.name for e in every], (), found.fit.values)
+    priors = [p for p in found.search.priors if all(any(u.name == n for u in problem.unknowns) for n in p.names)]
+    for e in every:
+        if e not in own:
+            priors.append(Prior.of(e.name, np.zeros(len(e.parameters)), np.array([10 * p.scale for p in e.parameters])))
+    for name, m in zip(found.names, found.manoeuvres, strict=True):
+        sigma = [found.search.period / 8, 50.0, 50.0, 50.0, *([found.search.period / 4] if m.burning else [])]
+        mean = [m.time, 0.0, 0.0, 0.0, *([m.duration] if m.burning else [])]
+        priors.append(Prior.of(name, np.array(mean), np.array(sigma)))
+    fit = gauss_newton(problem, point, priors, found.noise, iterations=5, enough=1e-4)
+    say("one orbit without manoeuvres")
+    first, last = model.span
+    plain_problem, _ = found.search.stretch(first, last, found.arc.start, {}, everything=True)
+    plain_problem = plain_problem.holding(*(e.name for e in own))
+    start = {**plain_problem.start, **{n: fit.values[n] for n in ("position", "velocity")}}
+    plain = gauss_newton(plain_problem, start, (), found.noise, iterations=8, enough=0.02)
+    say("proof")
+    seen, held = _rows(fit, found.noise, held_out=False), _rows(fit, found.noise, held_out=True)
+    still = np.zeros(fit.jacobian.shape[1])
+    after, ratio_after = _misfit(seen, still, found.noise)
+    held_after, held_ratio = _misfit(held, still, found.noise)
+    covariance = fit.covariance()
+    level = max(1.0, fit.square / fit.degrees) * found.shared
+    # The sigmas that are reported include errors that measurements share, and scatter above the measured noise.
+    spread = np.sqrt(np.diag(covariance) * level)
+    places = (last - first) / found.search.period * 48
+    effects = []
+
+    def proved(columns: list[int], fixed: list[int], values: np.ndarray, looks: float) -> _Proof:
+        c = covariance
+        if fixed:  # the time of a step that is not there means nothing
+            c = c - c[:, fixed] @ np.linalg.solve(c[np.ix_(fixed, fixed)], c[fixed, :])
+        pull = np.linalg.solve(c[np.ix_(columns, columns)], values)
+        change = -(c[:, columns] @ pull) / fit.scales
+        fitted, ratio = _misfit(seen, change, found.noise)
+        held_out, held_before = _misfit(held, change, found.noise)
+        score = float(values @ pull)
+        p = float(min(1.0, looks * chi2.sf(score / level, len(columns))))
+        return _Proof(score, p, {k: (v, after[k]) for k, v in fitted.items()},
+                      {k: (v, held_after[k]) for k, v in held_out.items()},
+                      (ratio, ratio_after, held_before, held_ratio))
+
+    named = {n: f"{FAMILY}:{k + 1}" for k, n in enumerate(found.names)}
+    for n in found.names:
+        c = fit.columns(n)
+        values = fit.values[n]
+        fixed = [c.start, *([c.start + 4] if len(values) == 5 else [])]
+        labels, units = ("time", "radial", "along", "cross", "duration"), ("s", "m/s", "m/s", "m/s", "s")
+        parameters = {p: {"value": float(v), "sigma": float(s), "unit": u}
+                      for p, v, s, u in zip(labels, values, spread[c], units, strict=False)}
+        instant = model.epoch + np.timedelta64(round(float(values[0]) * 1e6), "us")
+        proof = proved([c.start + 1, c.start + 2, c.start + 3], fixed, values[1:4], places)
+        effects.append(KeptEffect(named[n], (named[n],), parameters, proof, utc_text(instant),
+                                  "a burn of constant acceleration in orbital axes" if len(values) == 5 else
+                                  "a burn short against the orbit"))
+    flat = _without_prior(fit, [e.name for e in own if e.family == "range-bias"])
+    for e in every:
+        c = fit.columns(e.name)
+        values = fit.values[e.name]
+        parameters = {p.name: {"value": float(v), "sigma": float(s), "unit": p.unit}
+                      for p, v, s in zip(e.parameters, values, spread[c], strict=True)}
+        proof = proved(list(range(c.start, c.stop)), [], values, len(every))
+        if proof.p_value > LEVEL:
+            continue
+        group: tuple[str, ...] = (e.name,)
+        if e.family == "range-scale-error":
+            alone = float(values[0] ** 2 / flat[c.start] / level)
+            if chi2.sf(alone, 1) > LEVEL:
+                group = (e.name, *(o.name for o in own if o.family == "range-bias"))
+        effects.append(KeptEffect(e.name, group, parameters, proof, "", e.reference))
+    effects.sort(key=lambda e: -e.proof.score)
+    undetermined = _undetermined(fit, every, found)
+    unit_of = {r.channel: r.unit for r in fit.problem.residuals}
+    before_seen = _misfit(_rows(plain, found.noise, held_out=False), np.zeros(plain.jacobian.shape[1]), found.noise)[0]
+    before_held = _misfit(_rows(plain, found.noise, held_out=True), np.zeros(plain.jacobian.shape[1]), found.noise)[0]
+    structure = common_error(fit)
+    ends = {c: (v, held_after.get(c, float("nan")), unit_of[c]) for c, v in after.items()}
+    begins = {c: (v, before_held.get(c, float("nan")), unit_of[c]) for c, v in before_seen.items()}
+    verdict, why = _verdict(effects, ends, structure, ratio_after, len(found.names))
+    seconds = time.perf_counter() - began
+    return KeptExplanation(model, found, fit, plain, begins, ends, structure, tuple(effects), undetermined, verdict,
+                           why, seconds)
+
+
+def _without_prior(fit: Fit, names: Sequence[str]) -> np.ndarray:
+    """Variances (p,) where nothing is assumed of the size of some unknowns."""
+    prior = fit.prior.copy()
+    for n in names:
+        touched = np.any(prior[:, fit.columns(n)] != 0, axis=1)
+        prior[touched] *= 1e-3
+    return np.diag(replace(fit, prior=prior).covariance())
+
+
+def _undetermined(fit: Fit, effects: Sequence[OrbitEffect], found: Found) -> tuple[str, ...]:
+    """Numbers of which the data say little more than was assumed of their size, in words."""
+    words = []
+    covariance = fit.covariance()
+    for e in effects:
+        c = fit.columns(e.name)
+        width = np.array([_WIDTHS.get(e.family, 10 * p.scale) for p in e.parameters])
+        block = covariance[c, c]
+        mean_sigma = float(np.sqrt(block.mean()))
+        if e.each and mean_sigma > 0.1 * width[0] / np.sqrt(len(width)):
+            spread = block - block.mean(axis=0) - block.mean(axis=1)[:, None] + block.mean()
+            words.append(
+                f"the part of {e.family} that all stations share ({mean_sigma:.3g} m; their differences to "
+                f"{np.sqrt(np.diag(spread)).max():.2g} m), against the scale of the ranges and the longitude"
+            )
+            continue
+        for p, s, w in zip(e.parameters, np.sqrt(np.diag(block)), width, strict=True):
+            if s > _UNDETERMINED * w:
+                words.append(f"{e.name} {p.name}")
+    return tuple(words)
+
+
+def _verdict(effects: Sequence[KeptEffect], after: dict[str, tuple[float, float, str]], structure: float, ratio: float,
+             manoeuvres: int) -> tuple[str, str]:
+    others = ", ".join(e.name if len(e.group) == 1 else " or ".join(e.group) for e in effects
+                       if not e.name.startswith(FAMILY))
+    missing = f"{manoeuvres} manoeuvres" if manoeuvres > 1 else "one manoeuvre"
+    missing += f" and {others}" if others else ""
+    left = "; ".join(f"{a:.3g} {u} RMS in {c.replace('_', ' ')} ({b:.3g} {u} in data no fit has seen)"
+                     for c, (a, b, u) in after.items())
+    if ratio > 1.5:
+        return "unknown", f"missing were {missing}; the library holds no explanation of the rest: {left}"
+    tail = f"left is {left}"
+    if structure > 3.0:
+        tail += ", below the declared noise, but shared by stations or slow"
+    if any(len(e.group) > 1 for e in effects):
+        return "ambiguous", f"missing were {missing}, of which the data cannot tell apart those with an or; {tail}"
+    return "named", f"missing were {missing}; {tail}"
+
+
+def explained_tracking(tracking: Tracking, settings: OrbitSettings, *, hold_out: float = 0.2,
+                       without: Sequence[str] = (), say: Say | None = None) -> KeptExplanation | None:
+    """As :func:`explained_kept`, from the observations.
+
+    Raises:
+        InputError: data that cannot be used.
+    """
+    return explained_kept(orbit_model(tracking, settings), hold_out=hold_out, without=without, say=say)

@@ -1,0 +1,799 @@
+"""How many manoeuvres are in a long set of tracking data, when, how large, how long: found from the data alone.
+
+A kept satellite leaves the orbit that one set of initial conditions gives every few days or hours, and nothing of
+metres can be seen before these velocity steps are in the model. :func:`find_manoeuvres` finds them:
+
+1. Short stretches of data are fitted one by one; the quietest gives the noise and is where the search starts.
+2. The fitted stretch grows, forward and then backward in time, a part of a revolution at a time. After a velocity step
+   at time u the state differs by ``Phi(t, u) B dv``, Phi being the transition matrix of the orbit's own variational
+   equations, so for every u the likelihood ratio of a step is one linear problem with three unknowns (generalized
+   likelihood ratio test, Willsky and Jones 1976). Where the best u is significant, the step's time and velocity are
+   refined with everything else, and so is the length of the burn. A step of the wrong time is moved before a second
+   one is added.
+3. One joint fit of all data: one orbit, all manoeuvres with their times, the calibration of the stations. What is not
+   significant there leaves, what is missing is looked for again on all data, and the probability of a false name after
+   all these looks is stated.
+
+One continuous orbit is fitted rather than independent arcs: a manoeuvre changes the velocity only, so that each costs
+four numbers instead of six and the positions before and after bind each other. Between steps the model of the forces is
+that of the settings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.linalg import solve_triangular
+from scipy.stats import chi2, f
+
+from estimator.discrepancy.score import rows_of
+from estimator.models.errors import InfeasibleError
+from estimator.models.orbit_integration import Tolerance
+from estimator.orbit_signal import OrbitArc, OrbitSignal, VelocityStep
+from estimator.problem import Problem
+from estimator.residuals import KernelResidual, Linearization
+from estimator.unknowns import Unknown, Vector
+
+Say = Callable[[str], None]
+Values = dict[str, np.ndarray]
+
+FAMILY = "impulsive-manoeuvre"
+LEVEL = 1e-3  # probability of a manoeuvre where there is none, over the whole search
+_LOOSE = Tolerance(1e-12, (1e-3, 1e-3, 1e-3, 1e-7, 1e-7, 1e-7))  # m, m/s: far below any tracking noise
+_KEPT = 3.0  # revolutions of data that the growing stretch keeps
+_GROWTH = 0.5  # revolutions by which it grows
+_GRID = 48  # tried edges of a burn per revolution
+_DOUBT = 1e-7  # p-value of a burn near the growing edge below which it is fitted
+_MOST_PER_GROWTH = 4
+_AFTER = 0.3  # revolutions of data after the first sign of a step that are used to place it
+_INFLATED = 3.0  # factor on the sigmas of the calibration that the quiet data tell
+_BACK = 0.4  # revolutions before the first sign of a step in which it is looked for
+_EDGE_STEP = 3600.0  # s that an edge of a burn moves in the first step of a fit
+_FASTEST = 50.0  # m/s, prior sigma of a velocity step
+_LONGEST = 0.25  # revolutions, prior sigma of the duration of a burn
+
+
+@dataclass(frozen=True, eq=False)
+class Manoeuvre:
+    """One found manoeuvre.
+
+    Attributes:
+        time: of the impulse or the middle of the burn, s after the epoch.
+        velocity: (3,) radial, along-track, cross-track, m/s.
+        duration: s; 0 for an impulse.
+    """
+
+    time: float
+    velocity: np.ndarray
+    duration: float = 0.0
+
+    @property
+    def burning(self) -> bool:
+        """Whether it takes time."""
+        return self.duration > 0
+
+    def unknown(self, name: str) -> Unknown:
+        """The unknown that holds it: time, three velocities and, for a burn, the duration."""
+        if self.burning:
+            return Unknown(name, Vector(5, ("time", "radial", "along", "cross", "duration")), "s, m/s, m/s, m/s, s",
+                           (600.0, 0.1, 0.1, 0.1, 600.0))
+        return Unknown(name, Vector(4, ("time", "radial", "along", "cross")), "s, m/s", (600.0, 0.1, 0.1, 0.1))
+
+    @property
+    def start(self) -> np.ndarray:
+        """Values of :meth:`unknown`."""
+        return np.array([self.time, *self.velocity, *([self.duration] if self.burning else [])])
+
+    @staticmethod
+    def of(values: np.ndarray) -> Manoeuvre:
+        """From the values of :meth:`unknown`."""
+        return Manoeuvre(float(values[0]), np.array(values[1:4]), float(values[4]) if len(values) == 5 else 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Gaussian knowledge of some unknowns: ``root (value - mean)`` is noise of size one.
+
+    Attributes:
+        names: of the unknowns, in the order of ``mean`` (n,) and of the columns of ``root`` (k, n).
+    """
+
+    names: tuple[str, ...]
+    mean: np.ndarray
+    root: np.ndarray
+
+    @staticmethod
+    def of(name: str, mean: np.ndarray, sigma: np.ndarray) -> Prior:
+        """Independent numbers of one unknown."""
+        return Prior((name,), np.asarray(mean, dtype=float), np.diag(1.0 / np.asarray(sigma, dtype=float)))
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A Gauss-Newton fit of a stretch of data.
+
+    Attributes:
+        problem, values, parts: what was fitted and where it ended.
+        unknowns: in the order of the columns.
+        residual: (n,) rows over their noise; jacobian: (n, p) in units of the unknowns' scales.
+        prior: (k, p) rows of the priors in the same units; off: (k,) their residuals.
+        time: (n,) s of the rows.
+        square: sum of squares of ``residual``.
+    """
+
+    problem: Problem
+    values: Values
+    parts: Sequence[Linearization]
+    unknowns: tuple[Unknown, ...]
+    residual: np.ndarray
+    jacobian: np.ndarray
+    prior: np.ndarray
+    off: np.ndarray
+    time: np.ndarray
+
+    @property
+    def square(self) -> float:
+        """Sum of squares of the fitted rows."""
+        return float(self.residual @ self.residual)
+
+    @property
+    def rows(self) -> int:
+        """Number of fitted rows."""
+        return len(self.residual)
+
+    @property
+    def degrees(self) -> int:
+        """Rows less fitted numbers that the rows determine."""
+        return max(self.rows - min(self.jacobian.shape[1], self.rows - 1), 1)
+
+    @property
+    def scales(self) -> np.ndarray:
+        """Scale of every column."""
+        return np.concatenate([np.broadcast_to(u.scales, u.manifold.tangent) for u in self.unknowns])
+
+    def columns(self, name: str) -> slice:
+        """Columns of an unknown."""
+        at = 0
+        for u in self.unknowns:
+            if u.name == name:
+                return slice(at, at + u.manifold.tangent)
+            at += u.manifold.tangent
+        raise KeyError(name)
+
+    def knowledge(self, names: Sequence[str], factor: float) -> Prior:
+        """What the fit knows of some unknowns, all others being free, with sigmas ``factor`` times as large."""
+        rest = np.ones(self.jacobian.shape[1], dtype=bool)
+        for n in names:
+            rest[self.columns(n)] = False
+        order = np.concatenate([np.flatnonzero(rest), np.flatnonzero(~rest)])
+        upper = np.asarray(np.linalg.qr(np.vstack([self.jacobian, self.prior])[:, order], mode="r"))
+        k = int(rest.sum())
+        kept = tuple(u.name for u in self.unknowns if u.name in names)
+        mean = np.concatenate([np.atleast_1d(self.values[n]) for n in kept])
+        # Columns in the order of the unknowns, which is that of ``kept``.
+        return Prior(kept, mean, upper[k:, k:] / self.scales[~rest] / factor)
+
+    def covariance(self) -> np.ndarray:
+        """Posterior covariance (p, p) in the unknowns' units."""
+        r = np.linalg.qr(np.vstack([self.jacobian, self.prior]), mode="r")
+        inverse = solve_triangular(r, np.eye(len(r)))
+        root = inverse * self.scales[:, None]
+        return root @ root.T
+
+    def absorbed(self) -> tuple[np.ndarray, np.ndarray]:
+        """See :attr:`_absorbed`."""
+        return self._absorbed
+
+    @cached_property
+    def _absorbed(self) -> tuple[np.ndarray, np.ndarray]:
+        """Orthonormal columns (n, p) of what the fit absorbs, and the residual (n,) that it would end with.
+
+        Both to first order, so that the fit need not be at its optimum.
+        """
+        basis = np.linalg.qr(np.vstack([self.jacobian, self.prior]))[0]
+        everything = np.concatenate([self.residual, self.off])
+        left = everything - basis @ (basis.T @ everything)
+        return basis[: self.rows], left[: self.rows]
+
+
+def gauss_newton(problem: Problem, values: Mapping[str, np.ndarray], priors: Sequence[Prior],
+                 noise: Mapping[str, float], *, iterations: int = 12, tolerance: float = 0.05, enough: float = 1e-5,
+                 only: Sequence[str] | None = None) -> Fit:
+    """Fit a stretch of data with Gaussian priors, halving steps that make it worse.
+
+    Args:
+        problem: residuals; rejected samples count nothing.
+        values: start.
+        priors: of unknowns of the problem; others are passed over.
+        noise: factor on the declared noise by channel.
+        iterations: at most.
+        tolerance: length of the step, in sigmas of all unknowns together, that ends the iteration.
+        enough: relative drop of the cost that ends the iteration.
+        only: names of the unknowns that move; all free ones by default.
+    """
+    unknowns = tuple(u for u in problem.free if only is None or u.name in only)
+    scales = np.concatenate([np.broadcast_to(u.scales, u.manifold.tangent) for u in unknowns])
+    places, at = {}, 0
+    for u in unknowns:
+        places[u.name] = slice(at, at + u.manifold.tangent)
+        at += u.manifold.tangent
+    blocks, means = [np.zeros((0, at))], [np.zeros(0)]
+    for prior in priors:
+        if all(n in places for n in prior.names):
+            block = np.zeros((len(prior.root), at))
+            block[:, np.concatenate([np.arange(at)[places[n]] for n in prior.names])] = prior.root
+            blocks.append(block)
+            means.append(prior.root @ prior.mean)
+    root, target = np.vstack(blocks), np.concatenate(means)
+    inverse = root * scales
+
+    def rows(v: Mapping[str, np.ndarray]) -> tuple[Sequence[Linearization], np.ndarray, np.ndarray, np.ndarray]:
+        parts = problem.linearize(v)
+        rs, js, ts = [], [], []
+        for residual, part in zip(problem.residuals, parts, strict=True):
+            assert isinstance(residual, KernelResidual)
+            r, j = rows_of(part, unknowns, noise.get(residual.channel, 1.0))
+            kept = np.repeat(part.weight > 0, residual.kernel.size)
+            rs.append(r[kept])
+            js.append(j[kept])
+            ts.append(np.repeat(residual.time, residual.kernel.size)[kept])
+        return parts, np.concatenate(rs), np.concatenate(js), np.concatenate(ts)
+
+    def flat(v: Mapping[str, np.ndarray]) -> np.ndarray:
+        return np.concatenate([np.atleast_1d(v[u.name]) for u in unknowns])
+
+    current: Values = {k: np.array(v, dtype=float) for k, v in values.items()}
+    parts, r, j, time = rows(current)
+    off = root @ flat(current) - target
+    cost = float(r @ r + off @ off)
+    # Edges of burns act on data only once they pass them, so that their steps are held to a length that proves right.
+    edges = np.array([places[u.name].start + k for u in unknowns if u.name.startswith(FAMILY)
+                      for k in (0, 4)[: u.manifold.tangent - 3]], dtype=int)
+    longest, shrunk = _EDGE_STEP, 1.0
+    for _ in range(iterations):
+        stacked, right = np.vstack([j, inverse]), -np.concatenate([r, off])
+        full = _least_squares(stacked, right)
+        length = float(np.linalg.norm(stacked @ full))
+        if length < tolerance:
+            break
+        for _ in range(5):
+            step = shrunk * _held(stacked, right, full, edges, longest / scales[edges])
+            trial = dict(current)
+            for u in unknowns:
+                trial[u.name] = current[u.name] + (step * scales)[places[u.name]]
+                if u.name.startswith(FAMILY) and u.manifold.tangent == 5:
+                    # A duration is positive, and no step halves it more than once.
+                    trial[u.name][4] = max(trial[u.name][4], 0.5 * current[u.name][4], 10.0)
+            try:
+                with np.errstate(all="ignore"):
+                    new = rows(trial)
+                off_new = root @ flat(trial) - target
+                lowered = float(new[1] @ new[1] + off_new @ off_new)
+            except (InfeasibleError, ValueError):
+                lowered = np.inf
+            if np.isfinite(lowered) and lowered <= cost * (1 + 1e-12):
+                longest *= 2.0
+                shrunk = min(1.0, 2.0 * shrunk)
+                break
+            moved = np.max(np.abs(step * scales)[edges], initial=0.0)
+            longest = 0.25 * min(longest, moved) if len(edges) else longest
+            shrunk = shrunk if len(edges) and moved > 20.0 else 0.3 * shrunk
+        else:
+            break
+        drop = cost - lowered
+        current, (parts, r, j, time), off, cost = trial, new, off_new, lowered
+        if drop < 1e-3 + enough * cost:
+            break
+    return Fit(problem, current, parts, unknowns, r, j, inverse, off, time)
+
+
+def _least_squares(rows: np.ndarray, right: np.ndarray) -> np.ndarray:
+    q, upper = np.linalg.qr(rows)
+    return np.asarray(solve_triangular(upper, q.T @ right))
+
+
+def _held(rows: np.ndarray, right: np.ndarray, full: np.ndarray, edges: np.ndarray, limit: np.ndarray) -> np.ndarray:
+    """The least-squares step with the numbers ``edges`` within ``limit`` of zero, all others free."""
+    clipped = np.clip(full[edges], -limit, limit)
+    over = np.abs(full[edges]) > limit
+    if not over.any():
+        return full
+    fixed = edges[over]
+    free = np.setdiff1d(np.arange(len(full)), fixed)
+    step = np.empty(len(full))
+    step[fixed] = clipped[over]
+    step[free] = _least_squares(rows[:, free], right - rows[:, fixed] @ step[fixed])
+    step[edges] = np.clip(step[edges], -2 * limit, 2 * limit)
+    return step
+
+
+@dataclass(frozen=True, eq=False)
+class BurnTest:
+    """The likelihood ratio of one more burn with every pair of edges that was tried.
+
+    Attributes:
+        start, stop: (m,) s; gain: (m,) drop of the sum of squares; velocity: (m, 3) m/s in orbital axes.
+        p_value: of the best one, F test with the scatter that is left, times the number of pairs tried.
+    """
+
+    start: np.ndarray
+    stop: np.ndarray
+    gain: np.ndarray
+    velocity: np.ndarray
+    p_value: float
+
+    @property
+    def best(self) -> Manoeuvre:
+        """The most likely burn."""
+        k = int(np.argmax(self.gain))
+        a, b = self.start[k], self.stop[k]
+        return Manoeuvre(0.5 * (a + b), self.velocity[k], float(b - a))
+
+
+def common_error(fit: Fit) -> float:
+    """By how much errors that rows share make sums of squares of slow signatures larger than independent noise would.
+
+    Stations that range at the same instant share the satellite's delay and the model's error, and neighbouring instants
+    share slow errors: the variance of the sum over an instant against that of its rows, times (1 + r)/(1 - r) with r
+    the correlation of neighbouring instants. One for independent rows.
+    """
+    left = fit.absorbed()[1]
+    times, index = np.unique(np.round(fit.time, 1), return_inverse=True)
+    sums = np.bincount(index, left)
+    counts = np.bincount(index)
+    within = float(np.mean(sums**2 / counts)) / max(float(np.mean(left**2)), 1e-300)
+    scaled = sums / np.sqrt(counts)
+    correlation = float(np.sum(scaled[1:] * scaled[:-1]) / max(np.sum(scaled**2), 1e-300)) if len(times) > 4 else 0.0
+    correlation = float(np.clip(correlation, 0.0, 0.8))
+    return max(1.0, within) * (1 + correlation) / (1 - correlation)
+
+
+def burn_test(fit: Fit, arc: OrbitArc, nodes: np.ndarray, longest: float, shared: float = 1.0) -> BurnTest:
+    """Test a fit for one more burn between any two of ``nodes``, linearly, without another integration.
+
+    With ``K(t)`` the integral of ``Phi(u)^-1 B(u)`` up to t, a burn from a to b changes the state at t by
+    ``Phi(t) (K(min(t, b)) - K(min(t, a))) dv / (b - a)``: columns, Gram matrices and gradients of all pairs are
+    differences of those of single nodes.
+
+    Args:
+        fit: at its optimum, or near enough for it to be reached to first order.
+        arc: its orbit.
+        nodes: (m,) s, increasing, inside the span of the arc.
+        longest: s between the edges.
+        shared: of :func:`common_error`.
+    """
+    order = np.argsort(fit.time, kind="stable")
+    basis, r = (a[order] for a in fit.absorbed())
+    when, scales = fit.time[order], fit.scales
+    along = np.column_stack([fit.jacobian[order][:, fit.columns(u.name)] / scales[fit.columns(u.name)]
+                             for u in (arc.position, arc.velocity)])
+    m = len(nodes)
+    if m < 2:
+        return BurnTest(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros((0, 3)), 1.0)
+    state, chain = arc.at(nodes, fit.values)
+    turn = np.zeros((m, 6, 3))
+    turn[:, 3:] = [_axes(x) for x in state]
+    integral = CubicSpline(nodes, np.linalg.solve(chain[:, :, :6], turn)).antiderivative()
+    inside = np.clip(when[:, None], nodes[0], nodes[None, :])  # (n, m)
+    columns = np.empty((len(when), m, 3))
+    for k in range(m):
+        columns[:, k] = np.einsum("ni,nij->nj", along, integral(inside[:, k]))
+    flat = columns.reshape(len(when), -1)
+    gradient = (r @ flat).reshape(m, 3)
+    projected = (basis.T @ flat).reshape(-1, m, 3)
+    gram = (flat.T @ flat).reshape(m, 3, m, 3)
+    first, second = np.nonzero(np.triu(np.ones((m, m), dtype=bool), 1) & (nodes[None, :] - nodes[:, None] <= longest))
+    width = (nodes[second] - nodes[first])[:, None, None]
+    full = (gram[second, :, second] + gram[first, :, first] - gram[first, :, second]
+            - gram[second, :, first]) / width**2
+    moved = (projected[:, second] - projected[:, first]).transpose(1, 0, 2) / width
+    matrix = full - moved.transpose(0, 2, 1) @ moved
+    g = (gradient[second] - gradient[first]) / width[:, 0]
+    size = np.sqrt(np.maximum(np.einsum("kii->ki", full), 1e-300))
+    eigenvalues, vectors = np.linalg.eigh(matrix / (size[:, :, None] * size[:, None, :]))
+    amounts = np.einsum("kij,ki->kj", vectors, g / size)
+    seen = eigenvalues > 1e-6
+    gain = np.sum(np.where(seen, amounts**2 / np.where(seen, eigenvalues, 1.0), 0.0), axis=1)
+    velocity = -np.einsum("kij,kj->ki", vectors, np.where(seen, amounts / np.where(seen, eigenvalues, 1.0), 0.0)) / size
+    possible = np.linalg.norm(velocity, axis=1) < _FASTEST
+    gain = np.where(possible, gain, 0.0)
+    best = float(gain.max(initial=0.0))
+    degrees = max(fit.degrees - 5, 1)
+    scatter = max((float(r @ r) - best) / degrees, 0.5)
+    p = float(f.sf(best / 3 / scatter / shared, 3, max(degrees / shared, 3.0)))
+    return BurnTest(nodes[first], nodes[second], gain, velocity, min(1.0, p * len(first)))
+
+
+def _axes(state: np.ndarray) -> np.ndarray:
+    """Columns: radial, along-track and cross-track unit vectors of a state (6,)."""
+    radial = state[:3] / np.linalg.norm(state[:3])
+    cross = np.cross(state[:3], state[3:])
+    cross /= np.linalg.norm(cross)
+    return np.column_stack([radial, np.cross(cross, radial), cross])
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What the search ended with.
+
+    Attributes:
+        fit, arc: the joint fit of all data that were not held out, and its orbit.
+        names, manoeuvres: in the order of time.
+        noise: factor of the measured noise on the declared one by channel; shared: of :func:`common_error`.
+        looks: number of places where growth was tested.
+        search: what found it.
+    """
+
+    fit: Fit
+    arc: OrbitArc
+    names: tuple[str, ...]
+    manoeuvres: tuple[Manoeuvre, ...]
+    noise: dict[str, float]
+    shared: float
+    looks: int
+    search: Search
+
+
+@dataclass(eq=False)
+class Search:
+    """The search on one problem without manoeuvres; see the module.
+
+    Attributes:
+        problem: the joint problem whose arc carries derivatives along a thrust; rejected samples are not looked at.
+        priors: of unknowns other than the state.
+        period: of the orbit, s.
+        say: called with what is being done.
+    """
+
+    problem: Problem
+    priors: tuple[Prior, ...]
+    period: float
+    say: Say = lambda text: None
+    noise: dict[str, float] = field(default_factory=dict)
+    looks: int = 0
+    level: float = 1.0
+    shared: float = 1.0
+    calibrated: bool = False
+
+    def __post_init__(self) -> None:
+        first = self.problem.residuals[0]
+        assert isinstance(first, KernelResidual)
+        signal = first.signals[0]
+        assert isinstance(signal, OrbitSignal)
+        self.arc = signal.arc
+        times = [r.time[r.accepted] if r.accepted is not None else r.time for r in self._residuals]
+        self.times = np.unique(np.concatenate(times))
+        self._names = 0
+
+    @property
+    def _residuals(self) -> list[KernelResidual]:
+        return [r for r in self.problem.residuals if isinstance(r, KernelResidual)]
+
+    def stretch(self, low: float, high: float, start: float, steps: Mapping[str, Manoeuvre], *,
+                everything: bool = False) -> tuple[Problem, OrbitArc]:
+        """The problem of the data between two times, with the state at ``start`` and velocity steps by name."""
+        made = tuple(VelocityStep(m.unknown(n), burning=m.burning) for n, m in steps.items())
+        arc = replace(self.arc, start=start, span=(low, high), steps=made, tolerance=_LOOSE, _grids={}, _last={})
+        residuals = []
+        for r in self._residuals:
+            keep = (r.time >= low) & (r.time <= high)
+            if keep.any():
+                part = r if everything else r.subset(keep)
+                signals = tuple(replace(s, arc=arc) if isinstance(s, OrbitSignal) else s for s in part.signals)
+                residuals.append(replace(part, signals=signals))
+        needed = {u.name for r in residuals for u in r.unknowns}
+        unknowns = {u.name: u for u in (*self.problem.unknowns, *(s.unknown for s in made)) if u.name in needed}
+        values = {n: self.problem.start[n] for n in unknowns if n in self.problem.start}
+        values.update({n: m.start for n, m in steps.items()})
+        return Problem(tuple(unknowns.values()), tuple(residuals), values, self.problem.held & set(unknowns)), arc
+
+    def fit(self, low: float, high: float, start: float, state: np.ndarray, values: Mapping[str, np.ndarray],
+            steps: Mapping[str, Manoeuvre], **options: Any) -> tuple[Fit, OrbitArc]:
+        """Fit the data between two times from a state (6,) at ``start`` and values of the calibration."""
+        problem, arc = self.stretch(low, high, start, steps)
+        point = {**problem.start, **{n: v for n, v in values.items() if n in problem.start and n not in steps}}
+        point[arc.position.name], point[arc.velocity.name] = state[:3], state[3:]
+        priors = list(self.priors)
+        for n, m in steps.items():
+            sigma = [self.period / 8, _FASTEST, _FASTEST, _FASTEST, *([_LONGEST * self.period] if m.burning else [])]
+            mean = [m.time, 0.0, 0.0, 0.0, *([m.duration] if m.burning else [])]
+            priors.append(Prior.of(n, np.array(mean), np.array(sigma)))
+        return gauss_newton(problem, point, priors, self.noise, **options), arc
+
+    # ------------------------------------------------------------------------------------------------ quiet stretches
+
+    def quiet(self, state: np.ndarray, at: float) -> tuple[float, float, Fit]:
+        """The quietest stretch (low, high) and its fit; sets the noise.
+
+        Args:
+            state: (6,) near the orbit at the time ``at``.
+        """
+        length = 1.5 * self.period
+        first, last = float(self.times[0]), float(self.times[-1])
+        count = max(1, int((last - first) / (0.5 * length)))
+        lows = [first + k * 0.5 * length for k in range(count)] if last - first > length else [first]
+        found: list[tuple[float, float, float, Fit]] = []
+        values: Mapping[str, np.ndarray] = self.problem.start
+        here, state = at, np.asarray(state, dtype=float)
+        for low in lows:
+            self.say(f"quiet stretches, day {(low - first) / 86400:.1f}")
+            high = min(low + length, last)
+            inside = (self.times >= low) & (self.times <= high)
+            if inside.sum() < 4:
+                continue
+            start = float(self.times[inside][0])
+            _, arc = self.stretch(min(here, start), max(here, start), here, {})
+            point = {**self.problem.start, **values, arc.position.name: state[:3], arc.velocity.name: state[3:]}
+            moved = arc.at(np.array([start]), point)[0][0]
+            fit, arc = self.fit(low, high, start, moved, values, {}, iterations=15, enough=0.01)
+            if fit.rows < fit.jacobian.shape[1] + 4:
+                continue
+            found.append((fit.square / fit.degrees, low, high, fit))
+            here, state = start, np.concatenate([fit.values[arc.position.name], fit.values[arc.velocity.name]])
+        if not found:
+            raise ValueError("no stretch of the data is long enough for an orbit")
+        found.sort(key=lambda item: item[0])
+        quarter = found[: max(1, len(found) // 4)]
+        for channel in dict.fromkeys(r.channel for r in self._residuals):
+            squares = []
+            for _, _, _, fit in quarter:
+                rows = np.concatenate([p.whitened[p.weight > 0].ravel() for r, p
+                                       in zip(fit.problem.residuals, fit.parts, strict=True)
+                                       if isinstance(r, KernelResidual) and r.channel == channel] or [np.zeros(0)])
+                if len(rows):
+                    squares.append(float(np.mean(rows**2)) * fit.rows / fit.degrees)
+            self.noise[channel] = float(np.sqrt(np.median(squares))) if squares else 1.0
+        self.shared = float(np.median([common_error(item[3]) for item in quarter]))
+        return found[0][1], found[0][2], found[0][3]
+
+    # ------------------------------------------------------------------------------------------------ growth
+
+    def grow(self, low: float, high: float, fit: Fit, direction: int) -> dict[str, Manoeuvre]:
+        """Grow a quiet stretch to one end of the data; the manoeuvres met, by name."""
+        first, last = float(self.times[0]), float(self.times[-1])
+        steps: dict[str, Manoeuvre] = {}
+        done: dict[str, Manoeuvre] = {}
+        arc = _arc_of(fit)
+        start = arc.start
+        state = np.concatenate([fit.values[arc.position.name], fit.values[arc.velocity.name]])
+        values: Mapping[str, np.ndarray] = fit.values
+        edge = high if direction == 1 else low  # of the data in the stretch
+        other = low if direction == 1 else high
+        while (edge < last) if direction == 1 else (edge > first):
+            new = edge + direction * _GROWTH * self.period
+            while True:
+                fresh = (self.times - edge) * direction > 0
+                fresh &= (self.times - new) * direction <= 0
+                if fresh.sum() >= 3 or new > last or new < first:
+                    break
+                new += direction * _GROWTH * self.period
+            new = min(max(new, first), last)
+            self.say(f"day {(new - first) / 86400:.1f}, {len(done) + len(steps)} manoeuvres")
+            kept = new - direction * _KEPT * self.period
+            if (kept - other) * direction > 0:
+                inside = self.times[(self.times - kept) * direction >= 0]
+                begin = float(inside[0] if direction == 1 else inside[-1])
+                # The state moves to the new start; what lies behind it is done.
+                trimmed, arc = self.stretch(min(begin, start), max(begin, start), start, steps)
+                point = {**trimmed.start, **values, arc.position.name: state[:3], arc.velocity.name: state[3:]}
+                point.update({n: m.start for n, m in steps.items()})
+                state = arc.at(np.array([begin]), point)[0][0]
+                for n in [n for n, m in steps.items() if (m.time - begin) * direction < 0.5 * m.duration]:
+                    done[n] = steps.pop(n)
+                start, other = begin, kept
+            # Not refitted yet: a step that the model lacks would bend everything else.
+            ends = (other, new) if direction == 1 else (new, other)
+            fit, arc = self.fit(*ends, start, state, values, steps, iterations=0)
+            met = self._first_met(fit, arc, edge, new, direction)
+            if met is not None and not self.calibrated:
+                # One orbit through quiet data tells the calibration; a few hours between burns would not.
+                before, _ = self.fit(min(other, edge), max(other, edge), start, state, values, steps)
+                names = [u.name for u in before.unknowns if u.name not in (arc.position.name, arc.velocity.name)
+                         and not u.name.startswith(FAMILY)]
+                self.priors = (before.knowledge(names, _INFLATED),)
+                self.calibrated, values = True, before.values
+                state = _state(before, arc)
+            if met is not None:
+                # Enough data after the step to tell its time, and few enough for no other to be among them.
+                new = min(max(met + direction * _AFTER * self.period, first), last)
+                ends = (other, new) if direction == 1 else (new, other)
+                fit, arc = self.fit(*ends, start, state, values, steps, iterations=0)
+            fit, arc, steps = self._settled(fit, arc, steps, *ends, edge if met is None else met, direction)
+            state = np.concatenate([fit.values[arc.position.name], fit.values[arc.velocity.name]])
+            values, edge = fit.values, new
+        return {**done, **steps}
+
+    def _nodes(self, low: float, high: float) -> np.ndarray:
+        return np.linspace(low, high, max(8, int((high - low) / self.period * _GRID)))
+
+    def _first_met(self, fit: Fit, arc: OrbitArc, edge: float, new: float, direction: int) -> float | None:
+        """The first time beyond ``edge`` whose data, and all before, speak for a step; None where none does."""
+        fresh = np.unique(fit.time[((fit.time - edge) * direction > 0)])[::direction]
+        if len(fresh) > 12:
+            fresh = fresh[np.linspace(0, len(fresh) - 1, 13).astype(int)[1:]]
+        low, high = arc.span
+        for stop in fresh:
+            mask = (fit.time - stop) * direction <= 0
+            part = replace(fit, residual=fit.residual[mask], jacobian=fit.jacobian[mask], time=fit.time[mask])
+            back = edge - direction * _BACK * self.period
+            a, b = max(min(back, stop), low), min(max(back, stop), high)
+            self.looks += 1
+            if burn_test(part, arc, self._nodes(a, b), _LONGEST * self.period, self.shared).p_value < _DOUBT:
+                return float(stop)
+        return None
+
+    def _settled(self, fit: Fit, arc: OrbitArc, steps: dict[str, Manoeuvre], low: float, high: float, edge: float,
+                 direction: int) -> tuple[Fit, OrbitArc, dict[str, Manoeuvre]]:
+        """Add or move manoeuvres near the growing edge until none is significant.
+
+        The first test is made before anything is fitted to the new data: a step that the model lacks would bend all.
+        """
+        near = edge - direction * _BACK * self.period
+        new = high if direction == 1 else low
+        near, new = max(min(near, new), low), min(max(near, new), high)
+        nodes = self._nodes(near, new)
+        fitted = False
+        for _ in range(_MOST_PER_GROWTH):
+            test = burn_test(fit, arc, nodes, _LONGEST * self.period, self.shared)
+            self.looks += 1
+            if test.p_value > _DOUBT and fitted:
+                break
+            if test.p_value > _DOUBT:
+                fit, arc = self._scored(steps, fit, arc, low, high)[1:]
+                break
+            plain = _criterion(fit, self.shared)
+            self._names += 1
+            tried = _steps_of(fit, steps)
+            tried[f"{FAMILY}:{self._names}"] = test.best
+            options = [self._scored(tried, fit, arc, low, high)]
+            close = options[0][1].square / options[0][1].degrees < 2.0 * self.level
+            late = [n for n, m in steps.items() if near - 0.2 * self.period < m.time < new + 0.2 * self.period]
+            if late and not close:
+                name = max(late, key=lambda n: steps[n].time * direction)
+                rest = {n: m for n, m in _steps_of(fit, steps).items() if n != name}
+                without, arc2 = self.fit(low, high, arc.start, _state(fit, arc), fit.values, rest, iterations=0)
+                moved = burn_test(without, arc2, nodes, _LONGEST * self.period, self.shared)
+                if moved.gain.max(initial=0.0) > 0:
+                    options.append(self._scored({**rest, name: moved.best}, without, arc2, low, high))
+            best = min(options, key=lambda o: o[0])
+            if best[0] > plain - 10.0:
+                if not fitted:
+                    fit, arc = self._scored(steps, fit, arc, low, high)[1:]
+                break
+            fitted = True
+            fit, arc = best[1:]
+            steps = {s.unknown.name: Manoeuvre.of(fit.values[s.unknown.name]) for s in arc.steps}
+        fit, arc, steps = self._pruned(fit, arc, _steps_of(fit, steps), low, high)
+        self.level = max(1.0, 0.5 * self.level + 0.5 * min(fit.square / fit.degrees, 2 * self.level))
+        return fit, arc, steps
+
+    def _pruned(self, fit: Fit, arc: OrbitArc, steps: dict[str, Manoeuvre], low: float, high: float,
+                ) -> tuple[Fit, OrbitArc, dict[str, Manoeuvre]]:
+        """Without the steps that the others have made unnecessary."""
+        while steps:
+            covariance = fit.covariance()
+            size = {}
+            for n in steps:
+                c = fit.columns(n)
+                v = fit.values[n][1:4]
+                size[n] = float(v @ np.linalg.solve(covariance[c, c][1:4, 1:4], v))
+            name = min(size, key=lambda n: size[n])
+            rest = {n: m for n, m in steps.items() if n != name}
+            if size[name] > 200.0 * self.shared:
+                break
+            score, again, arc2 = self._scored(rest, fit, arc, low, high)
+            if score > _criterion(fit, self.shared):
+                break
+            fit, arc, steps = again, arc2, _steps_of(again, rest)
+        return fit, arc, steps
+
+    # ------------------------------------------------------------------------------------------------ all data
+
+    def run(self, state: np.ndarray, at: float) -> Found:
+        """The whole search; see the module.
+
+        Args:
+            state: (6,) near the orbit at the time ``at``, s.
+        """
+        declared = self.priors
+        low, high, quiet = self.quiet(state, at)
+        steps = self.grow(low, high, quiet, 1)
+        steps.update(self.grow(low, high, quiet, -1))
+        self.priors = declared
+        arc = _arc_of(quiet)
+        first, last = float(self.times[0]), float(self.times[-1])
+        here = _state(quiet, arc)
+        values: Mapping[str, np.ndarray] = quiet.values
+        removed = 0
+        while True:
+            self.say(f"joint fit with {len(steps)} manoeuvres")
+            fit, arc = self.fit(first, last, arc.start, here, values, steps, iterations=25, enough=1e-3)
+            here, values, steps = _state(fit, arc), fit.values, _steps_of(fit, steps)
+            if removed == 0:
+                # A burn that fell between two measurements may have been taken for an impulse at a wrong time: the same
+                # engine burns alike, so each gets a second chance from the others' duration.
+                usual = float(np.median([m.duration for m in steps.values()] or [0.0]))
+                if usual > 0.005 * self.period:
+                    steps = {n: replace(m, duration=usual) if not 0.4 * usual < m.duration < 2.5 * usual else m
+                             for n, m in steps.items()}
+                    self.say("joint fit, burns of the usual duration")
+                    again, arc2 = self.fit(first, last, arc.start, here, values, steps, iterations=25, enough=1e-3)
+                    if again.square < fit.square:
+                        fit, arc = again, arc2
+                    here, values = _state(fit, arc), fit.values
+                    steps = {n: Manoeuvre.of(fit.values[n]) for n in steps}
+            self.say(f"joint fit: {np.sqrt(fit.square / fit.degrees):.2f} times the noise of quiet data")
+            weak = self._weak(fit, steps)
+            if not weak or removed > 6:
+                break
+            removed += 1
+            changed = {n: weak.get(n, m) for n, m in steps.items()}
+            steps = {n: m for n, m in changed.items() if m is not None}
+        ordered = sorted(steps.items(), key=lambda item: item[1].time)
+        return Found(fit, arc, tuple(n for n, _ in ordered), tuple(m for _, m in ordered), dict(self.noise),
+                     self.shared, self.looks, self)
+
+    def p_values(self, fit: Fit, names: Sequence[str]) -> dict[str, float]:
+        """Probability of each manoeuvre's velocity without one, over all places where the search looked."""
+        covariance = fit.covariance()
+        scale = max(1.0, fit.square / fit.degrees) * self.shared
+        places = (self.times[-1] - self.times[0]) / self.period * _GRID
+        answer = {}
+        for n in names:
+            c = fit.columns(n)
+            v = fit.values[n][1:4]
+            statistic = float(v @ np.linalg.solve(covariance[c, c][1:4, 1:4], v)) / scale
+            answer[n] = float(min(1.0, chi2.sf(statistic, 3) * places))
+        return answer
+
+    def _weak(self, fit: Fit, steps: Mapping[str, Manoeuvre]) -> dict[str, Manoeuvre | None]:
+        """Manoeuvres to drop (None) or to call impulses, a third of the drops at a time: they lean on each other."""
+        found: dict[str, Manoeuvre | None] = {}
+        p = self.p_values(fit, list(steps))
+        drop = sorted((n for n in steps if p[n] > LEVEL), key=lambda n: -p[n])
+        for n in drop[: max(1, (len(drop) + 1) // 2)]:
+            found[n] = None
+        covariance = np.diag(fit.covariance())
+        scale = max(1.0, fit.square / fit.degrees) * self.shared
+        # Of an orbit that does not fit yet no length of a burn can be told.
+        fitted = fit.square / fit.degrees < 25.0 * self.level
+        for n, m in steps.items():
+            if not (fitted and m.burning) or n in found:
+                continue
+            if m.duration < 3 * np.sqrt(covariance[fit.columns(n)][4] * scale):
+                found[n] = replace(m, duration=0.0)
+        return found
+
+    def _scored(self, steps: Mapping[str, Manoeuvre], fit: Fit, arc: OrbitArc, low: float, high: float,
+                ) -> tuple[float, Fit, OrbitArc]:
+        again, new_arc = self.fit(low, high, arc.start, _state(fit, arc), fit.values, steps, iterations=8, enough=1e-3)
+        return _criterion(again, self.shared), again, new_arc
+
+
+def _criterion(fit: Fit, shared: float) -> float:
+    """Schwarz's criterion with unknown noise, which is never taken below half the measured one."""
+    left = fit.absorbed()[1]
+    n = fit.rows / shared
+    return n * float(np.log(max(float(left @ left) / fit.rows, 0.5))) + fit.jacobian.shape[1] * float(np.log(n))
+
+
+def _arc_of(fit: Fit) -> OrbitArc:
+    residual = fit.problem.residuals[0]
+    assert isinstance(residual, KernelResidual)
+    signal = residual.signals[0]
+    assert isinstance(signal, OrbitSignal)
+    return signal.arc
+
+
+def _state(fit: Fit, arc: OrbitArc) -> np.ndarray:
+    return np.concatenate([fit.values[arc.position.name], fit.values[arc.velocity.name]])
+
+
+def _steps_of(fit: Fit, steps: Mapping[str, Manoeuvre]) -> dict[str, Manoeuvre]:
+    """The manoeuvres at the values of a fit."""
+    return {n: Manoeuvre.of(fit.values[n]) if n in fit.values else m for n, m in steps.items()}
