@@ -266,7 +266,8 @@ def table(result: dict[str, Any]) -> str:
 def write_page(result: dict[str, Any]) -> None:
     """Put the table between its marks in docs/orbit.md."""
     words = (
-        f"{result['repeat']} solutions of ours and of Orekit in turn, after {WARM} uncounted ones, one process each."
+        f"{result['repeat']} solutions of ours and of Orekit in turn, after {WARM} uncounted ones, one process each; "
+        f"load of the machine {result['load']:.1f}."
     )
     if "ratio_seconds" in result:
         words += (
