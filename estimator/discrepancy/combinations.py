@@ -215,6 +215,45 @@ class LinearLibrary:
                 best, best_worth = here, worth
         return best
 
+    def copied(self, mine: int, size: np.ndarray, other: int) -> float:
+        """Part (0 to 1) of the squared signature of candidate ``mine`` at ``size`` (all its parameters) that ``other``
+        imitates."""
+        c = self.candidates[mine]
+        amounts = np.array([0.0 if c.effect.parameters[k].search else size[k] for k in c.parameters]) / c.scales
+        whole = float(amounts @ self._gram[np.ix_(c.columns, c.columns)] @ amounts)
+        along = self._across[np.ix_(c.columns, self._places[other])].T @ amounts
+        return float(along @ along) / whole if whole > 0 else 0.0
+
+    def exchanged(self, chosen: Sequence[int], forbidden: Collection[str]) -> list[int]:
+        """The set of the highest worth that keeps the last candidate of ``chosen`` and has another name for any others.
+
+        Look-alikes come in pairs: the best company of one name is not always that of the other.
+
+        Args:
+            chosen: indices; the last one stays.
+            forbidden: names that may not be taken.
+        """
+        best, worth = list(chosen), self.worth(chosen)
+        growing = True
+        while growing:
+            growing = False
+            for k in range(len(best) - 1):
+                kept = [*best[:k], *best[k + 1 :]]
+                present = self._names(best)
+                for name in self.names():
+                    if name in present or name in forbidden:
+                        continue
+                    setting = self.best_setting(kept, name)
+                    if setting is None:
+                        continue
+                    value = self.worth([setting, *kept])
+                    if value > worth + 1e-6:
+                        best, worth, growing = [setting, *kept], value, True
+                        break
+                if growing:
+                    break
+        return best
+
     def _names(self, chosen: Iterable[int]) -> frozenset[str]:
         return frozenset(self.candidates[i].name for i in chosen)
 

@@ -92,6 +92,8 @@ class _Cell:
     tests: int = 1  # independent frequencies of which the most striking one is shown
     period: float | None = None  # s
     members: tuple[_Cell, ...] = ()  # the cells of a sum
+    inner: np.ndarray | None = None  # (p, functions) products of the smooth functions with the fit's orthonormal rows
+    gradient: np.ndarray | None = None  # (functions,) products with the residual, calibration projected out
 
     @property
     def fast(self) -> bool:
@@ -139,22 +141,32 @@ def find_gap(problem: Problem, stacked: Stack, parts: Sequence[Linearization]) -
 def _together(cells: Sequence[_Cell]) -> list[_Cell]:
     """Slow structure of all arcs of a component, and of all components: weak in each, it may be plain in the sum."""
     found = []
-    slow = [c for c in cells if not c.fast]
-    for channel in dict.fromkeys(c.channel for c in slow):
-        mine = [c for c in slow if c.channel == channel]
+    for channel in dict.fromkeys(c.channel for c in cells if not c.fast):
+        mine = [c for c in cells if c.channel == channel and not c.fast]
         components = sorted({c.component for c in mine})
-        whole = float(chi2.sf(sum(c.statistic for c in mine), sum(c.degrees for c in mine)))
+        if len(mine) < 2:
+            continue
+        whole = chi2.sf(*_sum(mine))
         for k in components:
             some = [c for c in mine if c.component == k]
-            if len(some) < 2 and len(components) < 2:
-                continue
-            statistic, degrees = sum(c.statistic for c in some), sum(c.degrees for c in some)
-            own = float(chi2.sf(statistic, degrees))
+            statistic, degrees = _sum(some)
             found.append(_Cell(channel, "", k, sum(c.samples for c in some), some[0].start, some[-1].stop, statistic,
-                               degrees, min(own, whole), sum(c.smooth_power for c in some),
-                               max(some, key=lambda c: c.smooth_power).dominant, some[0].floor, tests=2,
-                               members=tuple(some)))
+                               degrees, float(min(chi2.sf(statistic, degrees), whole)),
+                               sum(c.smooth_power for c in some), max(some, key=lambda c: c.smooth_power).dominant,
+                               some[0].floor, tests=2, members=tuple(some)))
     return found
+
+
+def _sum(cells: Sequence[_Cell]) -> tuple[float, int]:
+    """Chi-square of cells together, which the calibration ties to each other."""
+    tied = [c for c in cells if c.inner is not None]
+    statistic, degrees = sum(c.statistic for c in cells if c.inner is None), sum(c.degrees for c in cells
+                                                                                  if c.inner is None)
+    if tied:
+        square, free = _square(np.concatenate([c.inner for c in tied if c.inner is not None], axis=1),
+                               np.concatenate([c.gradient for c in tied if c.gradient is not None]))
+        statistic, degrees = statistic + square, degrees + free
+    return statistic, max(degrees, 1)
 
 
 def _kernel_cells(residual: KernelResidual, part: Linearization, rows: slice, stacked: Stack) -> list[_Cell]:
@@ -174,19 +186,26 @@ def _kernel_cells(residual: KernelResidual, part: Linearization, rows: slice, st
             columns = np.zeros((rows.stop - rows.start, SMOOTH))
             columns[inside * width + component] = smooth
             basis = stacked.basis[rows]
-            # The calibration's rows elsewhere matter too, so the Gram matrix of the projection is I - (Q'E)'(Q'E).
             inner = basis.T @ columns
-            gram = np.eye(SMOOTH) - inner.T @ inner
-            gradient = columns.T @ stacked.residual[rows] - inner.T @ (stacked.basis.T @ stacked.residual)
-            eigenvalues, vectors = np.linalg.eigh(gram)
-            good = eigenvalues > 1e-6
-            amounts = (vectors[:, good].T @ gradient) / np.sqrt(eigenvalues[good])
-            statistic = float(amounts @ amounts)
             direct = columns.T @ stacked.residual[rows]
-            cells.append(_Cell(residual.channel, name, component, len(inside), start, stop, statistic,
-                               int(good.sum()), float(chi2.sf(statistic, max(int(good.sum()), 1))),
-                               float(direct @ direct), int(np.argmax(direct**2)), float(noise[component % len(noise)])))
+            gradient = direct - inner.T @ (stacked.basis.T @ stacked.residual)
+            statistic, degrees = _square(inner, gradient)
+            cells.append(_Cell(residual.channel, name, component, len(inside), start, stop, statistic, degrees,
+                               float(chi2.sf(statistic, max(degrees, 1))), float(direct @ direct),
+                               int(np.argmax(direct**2)), float(noise[component % len(noise)]),
+                               inner=inner, gradient=gradient))
     return cells
+
+
+def _square(inner: np.ndarray, gradient: np.ndarray) -> tuple[float, int]:
+    """Chi-square and its degrees of amounts of orthonormal functions E with products ``gradient`` after projection.
+
+    The calibration's rows elsewhere matter too: the Gram matrix of what it leaves of E is I - (Q'E)'(Q'E), ``inner``
+    being Q'E.
+    """
+    eigenvalues, vectors = np.linalg.eigh(np.eye(inner.shape[1]) - inner.T @ inner)
+    good = eigenvalues > 1e-6
+    return float(np.sum((vectors[:, good].T @ gradient) ** 2 / eigenvalues[good])), int(good.sum())
 
 
 def _position_cells(residual: TrajectoryResidual, part: Linearization) -> list[_Cell]:

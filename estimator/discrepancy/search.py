@@ -26,7 +26,7 @@ from estimator.discrepancy.score import Score, Signature, Stack, on_rows, scored
 from estimator.discrepancy.subject import Subject
 from estimator.estimate import Estimate
 from estimator.problem import Problem
-from estimator.residuals import Linearization
+from estimator.residuals import Linearization, Residual
 from estimator.solvers.gauss_newton import Options, solve
 from estimator.solvers.summary import summarized
 
@@ -36,6 +36,7 @@ INDISTINGUISHABLE = 4.6  # log odds (100 to 1) below which two names explain the
 TRIED_SETTINGS = 6  # settings of a searched parameter that take part in sets
 RIVALS = 5  # names that are refitted in the place of an accepted one
 TURNS = 16  # sets that are refitted before the search stops
+ALIKE = 0.5  # part of an effect's squared signature that a name must copy to be looked at in its place
 REFUSALS = 4  # sets in a row that a joint fit did not bear out before the search stops
 LINEAR = 0.03  # part of a drop that the linear model may be wrong by
 
@@ -155,29 +156,33 @@ class Workflow:
 
     # ------------------------------------------------------------------------------------------------ fits
 
-    def fit(self, effects: Sequence[str], start: Mapping[str, np.ndarray] | None = None) -> Refit:
+    def fit(self, effects: Sequence[str], near: Refit | None = None,
+            sizes: Mapping[str, np.ndarray] | None = None) -> Refit:
         """The joint fit of the training data with these effects (kept once made).
 
         Args:
             effects: names.
-            start: values of a neighbouring fit; then only the part of the problem that the newcomers touch is solved,
-                the rest being at its optimum already.
+            near: a neighbouring fit to start from, the plain one without. Where it lacks some of the effects and has no
+                others, only the part of the problem that the newcomers touch is solved, the rest being at its optimum.
+            sizes: where to start the parameters of newcomers.
         """
         key = tuple(sorted(effects))
         if key in self._fits:
             return self._fits[key]
         problem = self.subject.problem(key, (), hold_out=True)
-        if start:
-            names = {u.name for u in problem.unknowns}
-            known = {n: v for n, v in start.items() if n in names and np.shape(v) == np.shape(problem.start[n])}
-            changed = [u.name for u in problem.unknowns if u.name in key and u.name not in known]
+        near = near or self._fits.get(())
+        if near is None:
+            estimate = solve(problem, Options(tolerance=1e-3, iterations=60))
+        else:
+            start = {**near.estimate.values, **(sizes or {})}
+            known = {n: np.asarray(start[n]) for n, v in problem.start.items()
+                     if n in start and np.shape(start[n]) == np.shape(v)}
             problem = problem.starting_at(known)
-            values = _polished(problem, set(changed or key))
+            gone = set(near.effects) - set(key)
+            values = _polished(problem, {u.name for u in problem.unknowns} if gone else set(key) - set(near.effects))
             prepared = problem.prepared(values)
             estimate = summarized(prepared, values, prepared.linearize(values), converged=True, reason="",
                                   iterations=0, solver="gauss-newton", seconds=0.0)
-        else:
-            estimate = solve(problem, Options(tolerance=1e-3, iterations=60))
         if not self._fits:
             self._noise = dict(stack(estimate.problem, estimate.parts).scale)
         cost = sum(p.cost / self._noise.get(r.name, 1.0) ** 2
@@ -317,9 +322,9 @@ class Workflow:
         """Where the model with these effects and the data disagree."""
         return self.round(effects).gap
 
-    def start_of(self, here: _Round, chosen: Sequence[int]) -> dict[str, np.ndarray]:
-        """Start values of a refit: the accepted fit, newcomers at the size that the linear model expects."""
-        start = {n: np.asarray(v) for n, v in here.fit.estimate.values.items()}
+    def sizes_of(self, here: _Round, chosen: Sequence[int]) -> dict[str, np.ndarray]:
+        """Start values of newcomers: the size that the linear model expects."""
+        start: dict[str, np.ndarray] = {}
         for i, size in zip(chosen, here.library.explained(chosen).sizes, strict=True):
             effect = here.library.candidates[i].effect
             if effect.name in here.fit.effects:
@@ -371,7 +376,7 @@ class Workflow:
             if names == set(accepted) or names in refused or in_a_row == REFUSALS:
                 return accepted
             self.say("joint fit with " + (", ".join(sorted(names)) or "nothing"))
-            refit = self.fit(sorted(names), self.start_of(here, chosen))
+            refit = self.fit(sorted(names), here.fit, self.sizes_of(here, chosen))
             sound = all(self.plausible(n, refit) for n in names)
             if sound and self.worth(refit) > self.worth(here.fit) + 1e-3:
                 accepted, in_a_row = refit.effects, 0
@@ -395,32 +400,41 @@ class Workflow:
     def loss(self, effects: Sequence[str], name: str) -> tuple[float, float]:
         """Rise of the sum of squares without one of the effects, and how probable that is by noise after the search."""
         full = self.fit(effects)
-        without = self.fit([n for n in effects if n != name], full.estimate.values)
+        without = self.fit([n for n in effects if n != name], full)
         drop = without.cost - full.cost
         return drop, self.significant(drop, name)
 
     def rivals(self, effects: tuple[str, ...], name: str, excluded: Collection[str]) -> list[tuple[str, Refit]]:
-        """Joint fits with another effect in the place of ``name``, of all that could be worth as much."""
+        """Joint fits with another effect in the place of ``name``, of all that could be worth as much.
+
+        The others may change with it: look-alikes come in pairs.
+        """
         here = self.round(effects)
         library = here.library
         rest = [i for i in here.members if library.candidates[i].name != name]
         full, without = library.explained(here.members), library.explained(rest)
         room = 3 * INDISTINGUISHABLE + 0.05 * (full.drop - without.drop)
+        mine, size = next((i, s) for i, s in zip(here.members, full.sizes, strict=True)
+                          if library.candidates[i].name == name)
         found = []
         for other in library.names():
             if other in effects or other in excluded:
                 continue
             i = library.best_setting(rest, other)
-            assert i is not None
-            tried = library.explained([*rest, i])
+            if i is None or library.copied(mine, size, i) < ALIKE:
+                continue
+            chosen = [*rest, i]
+            if rest and library.worth(chosen) <= full.worth - INDISTINGUISHABLE:
+                chosen = library.exchanged(chosen, {name, *excluded})
+            tried = library.explained(chosen)
             if tried.plausible and tried.worth > full.worth - room and \
                     self.significant(tried.drop - without.drop, other) < SIGNIFICANT:
-                found.append((tried.worth, other, i))
+                found.append((tried.worth, other, chosen))
         fits = []
-        for _, other, i in sorted(found, reverse=True)[:RIVALS]:
+        for _, other, chosen in sorted(found, reverse=True)[:RIVALS]:
             self.say(f"{other} in place of {name}?")
-            refit = self.fit([*(n for n in effects if n != name), other], self.start_of(here, [*rest, i]))
-            if self.plausible(other, refit):
+            refit = self.fit([library.candidates[i].name for i in chosen], here.fit, self.sizes_of(here, chosen))
+            if all(self.plausible(n, refit) for n in refit.effects if n not in effects):
                 fits.append((other, refit))
         return fits
 
@@ -435,9 +449,10 @@ class Workflow:
 
     def group(self, effects: tuple[str, ...], name: str, excluded: Collection[str] = ()) -> tuple[str, ...]:
         """Names that explain the data as well as ``name`` beside the other effects, no richer than it."""
-        worth = self.worth(self.fit(effects))
+        full = self.fit(effects)
+        worth = self.worth(full)
         degrees = self._degrees.get(name, 1)
-        without = self.fit([n for n in effects if n != name])
+        without = self.fit([n for n in effects if n != name], full)
         alike = [name]
         for other, refit in self.rivals(effects, name, excluded):
             if self._degrees.get(other, 1) <= degrees and self.worth(refit) > worth - INDISTINGUISHABLE and \
@@ -476,7 +491,7 @@ class Workflow:
             accepted = self.needed(self.best_set(accepted, excluded))
             accepted = self.needed(self.exchanged(accepted, excluded))
             ordered = self.ordered(accepted)
-            unpaid = next((n for k, n in enumerate(ordered) if not self._pays(ordered[:k], ordered[: k + 1], n)), None)
+            unpaid = next((n for k, n in enumerate(ordered) if not self._pays(ordered, k)), None)
             if unpaid is not None:
                 self.say(f"{unpaid} does not pay on held-out data")
                 excluded.add(unpaid)
@@ -514,17 +529,18 @@ class Workflow:
             left.remove(best)
         return tuple(here.library.candidates[i].name for i in order)
 
-    def _pays(self, before: Sequence[str], after: Sequence[str], name: str) -> bool:
-        second = self.fit(after).estimate
-        first = self.fit(before, second.values).estimate
-        return pays(first.problem, first.parts, second.problem, second.parts, channels_of(second.problem, name))
+    def _pays(self, order: tuple[str, ...], place: int) -> bool:
+        """Whether held-out data bear out the effect at ``place``, after those before it."""
+        near = self.fit(order)
+        second, first = (self.fit(order[:k], near).estimate for k in (place + 1, place))
+        return pays(first.problem, first.parts, second.problem, second.parts,
+                    channels_of(second.problem, order[place]))
 
     def _findings(self, order: tuple[str, ...], excluded: Collection[str]) -> tuple[Finding, ...]:
         findings = []
         for k, name in enumerate(order):
             self.say(f"what explains the data as well as {name}")
-            second = self.fit(order[: k + 1])
-            first = self.fit(order[:k], second.estimate.values)
+            second, first = (self.fit(order[:j], self.fit(order)) for j in (k + 1, k))
             expected = next((s for s in self.round(order[:k]).table if s.name == name), None)
             assert expected is not None
             one, two = first.estimate, second.estimate
@@ -540,6 +556,7 @@ def _polished(problem: Problem, names: set[str]) -> dict[str, np.ndarray]:
     """Values with the named unknowns, and all that is connected to them through residuals, at their optimum."""
     free = {u.name for u in problem.free}
     reached = names & free
+    touched: list[Residual] = []
     growing = True
     while growing:
         touched = [r for r in problem.residuals if any(u.name in reached for u in r.unknowns)]
