@@ -169,7 +169,7 @@ class OrbitArc:
             if s.burning and abs(s.at(values) - self.start) < half:
                 burning.append(s)
         switches.sort(key=lambda item: item[0] * direction)
-        segments, t = [], self.start
+        segments, t, width = [], self.start, 60.0
         for place, switch, side in [*switches, (end, None, 0)]:
             on = tuple((step_columns[s.unknown.name], s.velocity(values), s.duration(values)) for s in burning)
             if self.thrust:
@@ -177,7 +177,11 @@ class OrbitArc:
                 parameters[self.motion.slices[self.thrust]] = sum((v / d for _, v, d in on), np.zeros(3))
             grid = self._grid(t, place, x)
             orbit, found = propagate(self.motion.step, self.motion.step.start(x), parameters, self.inputs,
-                                     np.array([t, place]), grid=grid, tolerance=self.tolerance)
+                                     np.array([t, place]), grid=grid, tolerance=self.tolerance,
+                                     first_step=width)
+            # The next segment starts with the step that the orbit allows, not with a small one after every burn.
+            if len(orbit.times) > 2:
+                width = max(60.0, float(np.max(np.abs(np.diff(orbit.times[-3:])))))
             if grid is None:
                 self._keep(t, place, x, found)
             segments.append(_Segment(orbit, chain, min(t, place), max(t, place), on))

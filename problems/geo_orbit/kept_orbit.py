@@ -41,6 +41,7 @@ _PARAMETER = 3.986004418e14  # m3/s2 of the Earth
 _SHORTEST_SPAN = 3.0  # revolutions that the search for manoeuvres asks for
 _OFTEN = 6.0  # instants of measurement in a revolution that it asks for
 _BLOCKS = 8  # held-out passes are so many to a revolution
+_MOST_ARCS = 10
 _MOST = 6  # effects beside calibration and manoeuvres
 _UNDETERMINED = 0.5  # posterior over prior sigma beyond which the data say nothing of a number
 
@@ -123,6 +124,8 @@ class KeptExplanation:
     """The answer for a kept satellite.
 
     Attributes:
+        structure: of :func:`problems.geo_orbit.manoeuvres.common_error`; ratio: what is left over the declared noise.
+        arcs: the answers of successive arcs, where one orbit does not fit all data; the calibration is the longest's.
         model: the data; found: the search; fit: the joint fit with every effect; plain: one orbit without any.
         effects: largest first.
         undetermined: numbers of the calibration that the data leave open, in words.
@@ -136,11 +139,13 @@ class KeptExplanation:
     before: dict[str, tuple[float, float, str]]
     after: dict[str, tuple[float, float, str]]
     structure: float
+    ratio: float
     effects: tuple[KeptEffect, ...]
     undetermined: tuple[str, ...]
     verdict: str
     why: str
     seconds: float
+    arcs: tuple[KeptExplanation, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """The machine-readable answer of ``boresight orbit explain``."""
@@ -166,7 +171,11 @@ class KeptExplanation:
                 for c, (fitted, held, unit) in self.after.items()
             ],
             "undetermined": list(self.undetermined),
-            "manoeuvres": len(self.found.names),
+            "manoeuvres": sum(e.name.startswith(FAMILY) for e in self.effects),
+            "spans": [
+                [utc_text(self.model.epoch + np.timedelta64(round(t * 1e6), "us")) for t in (p.found.low, p.found.high)]
+                for p in self.arcs
+            ],
             "seconds": self.seconds,
         }
 
@@ -271,15 +280,61 @@ def explained_kept(model: OrbitModel, *, hold_out: float = 0.2, without: Sequenc
         return None
     model = replace(model, finite_burns=True)
     effects = calibration(model, without)
-    problem = _with_held_out(orbit_problem(model, [e.name for e in effects]), period, hold_out)
-    search = Search(problem, _priors(effects, problem), period, say)
-    try:
-        found = search.run(state, 0.0)
-    except InputError:
+    pieces: list[KeptExplanation] = []
+    spans = [(first, last)]
+    while spans and len(pieces) < _MOST_ARCS:
+        low, high = spans.pop(0)
+        if high - low < _SHORTEST_SPAN * period:
+            continue
+        part = _between(model, low, high)
+        problem = _with_held_out(orbit_problem(part, [e.name for e in effects]), period, hold_out)
+        search = Search(problem, _priors(effects, problem), period, say)
+        try:
+            found = search.run(state, 0.0)
+        except InputError:
+            continue
+        # What one orbit does not fit is looked at by itself.
+        spans += [(low, found.low - 1.0), (found.high + 1.0, high)]
+        pieces.append(_concluded(_between(model, found.low, found.high), found, effects, without, hold_out, say))
+    if not any(p.found.names for p in pieces):
         return None
-    if not found.names:
-        return None
-    return _concluded(model, found, effects, without, say, began)
+    return _merged(model, pieces, time.perf_counter() - began)
+
+
+def _between(model: OrbitModel, low: float, high: float) -> OrbitModel:
+    """The model of the data between two times, s after the same epoch."""
+    masks = {f"{o.name}/{o.kind}": (model.seconds(o.time) >= low) & (model.seconds(o.time) <= high)
+             for o in model.tracking.observations}
+    return model.thinned(masks)
+
+
+def _merged(model: OrbitModel, pieces: Sequence[KeptExplanation], seconds: float) -> KeptExplanation:
+    """One answer from those of successive arcs: all manoeuvres, the other effects of the longest arc."""
+    longest = max(pieces, key=lambda p: p.fit.rows)
+    moves = sorted((e for p in pieces for e in p.effects if e.name.startswith(FAMILY)), key=lambda e: e.utc)
+    names = {id(e): f"{FAMILY}:{k + 1}" for k, e in enumerate(moves)}
+    effects = [replace(e, name=names[id(e)], group=(names[id(e)],)) for e in moves]
+    effects += [e for e in longest.effects if not e.name.startswith(FAMILY)]
+    effects.sort(key=lambda e: -e.proof.score)
+    rows = np.array([p.fit.rows for p in pieces], dtype=float)
+
+    def pooled(tables: Sequence[dict[str, tuple[float, float, str]]]) -> dict[str, tuple[float, float, str]]:
+        result = {}
+        for c in dict.fromkeys(k for t in tables for k in t):
+            w = np.array([n for n, t in zip(rows, tables, strict=True) if c in t])
+            values = np.array([t[c][:2] for t in tables if c in t])
+            known = np.where(np.isfinite(values), values, 0.0)
+            weight = w[:, None] * np.isfinite(values)
+            mean = np.sqrt(np.sum(weight * known**2, axis=0) / np.maximum(np.sum(weight, axis=0), 1e-300))
+            result[c] = (float(mean[0]), float(mean[1]), next(t[c][2] for t in tables if c in t))
+        return result
+
+    before, after = pooled([p.before for p in pieces]), pooled([p.after for p in pieces])
+    structure = float(np.sum(rows * [p.structure for p in pieces]) / rows.sum())
+    ratio = float(np.sqrt(np.sum(rows * [p.ratio**2 for p in pieces]) / rows.sum()))
+    verdict, why = _verdict(effects, after, structure, ratio, len(moves))
+    return replace(longest, model=model, before=before, after=after, structure=structure, ratio=ratio,
+                   effects=tuple(effects), verdict=verdict, why=why, seconds=seconds, arcs=tuple(pieces))
 
 
 def _with_held_out(problem: Problem, period: float, hold_out: float) -> Problem:
@@ -293,12 +348,11 @@ def _with_held_out(problem: Problem, period: float, hold_out: float) -> Problem:
 
 
 def _with_manoeuvres(model: OrbitModel, found: Found, effects: Sequence[str], candidates: Sequence[str],
-                     values: dict[str, np.ndarray]) -> tuple[Problem, dict[str, np.ndarray]]:
+                     hold_out: float) -> tuple[Problem, dict[str, np.ndarray]]:
     """The joint problem with the found manoeuvres and further effects, and a point near its optimum."""
-    residuals = {r.name: r for r in found.search.problem.residuals if isinstance(r, KernelResidual)}
+    values = found.fit.values
     base = orbit_problem(model, effects, candidates=candidates)
-    same = [replace(r, accepted=residuals[r.name].accepted) for r in base.residuals if isinstance(r, KernelResidual)]
-    search = replace(found.search, problem=base.with_residuals(same))
+    search = replace(found.search, problem=_with_held_out(base, found.search.period, hold_out))
     steps = dict(zip(found.names, found.manoeuvres, strict=True))
     first, last = model.span
     problem, _ = search.stretch(first, last, found.arc.start, steps, everything=True)
@@ -306,7 +360,7 @@ def _with_manoeuvres(model: OrbitModel, found: Found, effects: Sequence[str], ca
     return problem.freeing(*candidates), point
 
 
-def _further(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], without: Sequence[str],
+def _further(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], without: Sequence[str], hold_out: float,
              say: Say) -> list[str]:
     """Names of other effects of the library that the joint fit still misses, best first."""
     fit, noise = found.fit, found.noise
@@ -316,7 +370,8 @@ def _further(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], withou
     if not offered:
         return []
     say("scores of the library")
-    problem, point = _with_manoeuvres(model, found, [e.name for e in own], [e.name for e in offered], fit.values)
+    names = [e.name for e in offered]
+    problem, point = _with_manoeuvres(model, found, [e.name for e in own], names, hold_out)
     wide = gauss_newton(problem, point, found.search.priors, noise, iterations=0)
     ours = np.concatenate([np.arange(wide.jacobian.shape[1])[wide.columns(u.name)] for u in fit.unknowns])
     held = _rows(wide, noise, held_out=True)
@@ -369,12 +424,12 @@ def _further(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], withou
     return chosen_
 
 
-def _concluded(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], without: Sequence[str], say: Say,
-               began: float) -> KeptExplanation:
-    further = _further(model, found, own, without, say)
+def _concluded(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], without: Sequence[str], hold_out: float,
+               say: Say) -> KeptExplanation:
+    further = _further(model, found, own, without, hold_out, say)
     every = (*own, *chosen(model.layout, further))
     say("joint fit with " + (", ".join(further) or "nothing further"))
-    problem, point = _with_manoeuvres(model, found, [e.name for e in every], (), found.fit.values)
+    problem, point = _with_manoeuvres(model, found, [e.name for e in every], (), hold_out)
     priors = [p for p in found.search.priors if all(any(u.name == n for u in problem.unknowns) for n in p.names)]
     for e in every:
         if e not in own:
@@ -386,7 +441,8 @@ def _concluded(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], with
     fit = gauss_newton(problem, point, priors, found.noise, iterations=5, enough=1e-4)
     say("one orbit without manoeuvres")
     first, last = model.span
-    plain_problem, _ = found.search.stretch(first, last, found.arc.start, {}, everything=True)
+    bare = _with_held_out(orbit_problem(model, [e.name for e in own]), found.search.period, hold_out)
+    plain_problem, _ = replace(found.search, problem=bare).stretch(first, last, found.arc.start, {}, everything=True)
     plain_problem = plain_problem.holding(*(e.name for e in own))
     start = {**plain_problem.start, **{n: fit.values[n] for n in ("position", "velocity")}}
     plain = gauss_newton(plain_problem, start, (), found.noise, iterations=8, enough=0.02)
@@ -453,9 +509,8 @@ def _concluded(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], with
     ends = {c: (v, held_after.get(c, float("nan")), unit_of[c]) for c, v in after.items()}
     begins = {c: (v, before_held.get(c, float("nan")), unit_of[c]) for c, v in before_seen.items()}
     verdict, why = _verdict(effects, ends, structure, ratio_after, len(found.names))
-    seconds = time.perf_counter() - began
-    return KeptExplanation(model, found, fit, plain, begins, ends, structure, tuple(effects), undetermined, verdict,
-                           why, seconds)
+    return KeptExplanation(model, found, fit, plain, begins, ends, structure, ratio_after, tuple(effects), undetermined,
+                           verdict, why, 0.0)
 
 
 def _without_prior(fit: Fit, names: Sequence[str]) -> np.ndarray:

@@ -32,7 +32,7 @@ from scipy.linalg import solve_triangular
 from scipy.stats import chi2, f
 
 from estimator.discrepancy.score import rows_of
-from estimator.models.errors import InfeasibleError
+from estimator.models.errors import InfeasibleError, TooFewDataError
 from estimator.models.orbit_integration import Tolerance
 from estimator.orbit_signal import OrbitArc, OrbitSignal, VelocityStep
 from estimator.problem import Problem
@@ -53,6 +53,8 @@ _MOST_PER_GROWTH = 4
 _AFTER = 0.3  # revolutions of data after the first sign of a step that are used to place it
 _INFLATED = 3.0  # factor on the sigmas of the calibration that the quiet data tell
 _BACK = 0.4  # revolutions before the first sign of a step in which it is looked for
+_JOINED = 6.0  # revolutions by which the joint fit is extended
+_BROKEN = 16.0  # mean square over that of quiet data beyond which one orbit does not fit
 _EDGE_STEP = 3600.0  # s that an edge of a burn moves in the first step of a fit
 _FASTEST = 50.0  # m/s, prior sigma of a velocity step
 _LONGEST = 0.25  # revolutions, prior sigma of the duration of a burn
@@ -422,7 +424,8 @@ class Found:
     """What the search ended with.
 
     Attributes:
-        fit, arc: the joint fit of all data that were not held out, and its orbit.
+        fit, arc: the joint fit of the data that were not held out, and its orbit.
+        low, high: what of the data one orbit fits, s.
         names, manoeuvres: in the order of time.
         noise: factor of the measured noise on the declared one by channel; shared: of :func:`common_error`.
         looks: number of places where growth was tested.
@@ -431,6 +434,8 @@ class Found:
 
     fit: Fit
     arc: OrbitArc
+    low: float
+    high: float
     names: tuple[str, ...]
     manoeuvres: tuple[Manoeuvre, ...]
     noise: dict[str, float]
@@ -515,8 +520,9 @@ class Search:
         """
         length = 1.5 * self.period
         first, last = float(self.times[0]), float(self.times[-1])
-        count = max(1, int((last - first) / (0.5 * length)))
-        lows = [first + k * 0.5 * length for k in range(count)] if last - first > length else [first]
+        stride = length * (0.5 if last - first < 40 * self.period else 0.75)
+        count = max(1, int((last - first) / stride))
+        lows = [first + k * stride for k in range(count)] if last - first > length else [first]
         found: list[tuple[float, float, float, Fit]] = []
         values: Mapping[str, np.ndarray] = self.problem.start
         here, state = at, np.asarray(state, dtype=float)
@@ -536,7 +542,7 @@ class Search:
             found.append((fit.square / fit.degrees, low, high, fit))
             here, state = start, np.concatenate([fit.values[arc.position.name], fit.values[arc.velocity.name]])
         if not found:
-            raise ValueError("no stretch of the data is long enough for an orbit")
+            raise TooFewDataError("no stretch of the data is long enough for an orbit")
         found.sort(key=lambda item: item[0])
         quarter = found[: max(1, len(found) // 4)]
         for channel in dict.fromkeys(r.channel for r in self._residuals):
@@ -553,8 +559,8 @@ class Search:
 
     # ------------------------------------------------------------------------------------------------ growth
 
-    def grow(self, low: float, high: float, fit: Fit, direction: int) -> dict[str, Manoeuvre]:
-        """Grow a quiet stretch to one end of the data; the manoeuvres met, by name."""
+    def grow(self, low: float, high: float, fit: Fit, direction: int) -> tuple[dict[str, Manoeuvre], float]:
+        """Grow a quiet stretch to one end of the data, or until nothing helps; manoeuvres by name, and the end."""
         first, last = float(self.times[0]), float(self.times[-1])
         steps: dict[str, Manoeuvre] = {}
         done: dict[str, Manoeuvre] = {}
@@ -564,6 +570,7 @@ class Search:
         values: Mapping[str, np.ndarray] = fit.values
         edge = high if direction == 1 else low  # of the data in the stretch
         other = low if direction == 1 else high
+        good = edge
         while (edge < last) if direction == 1 else (edge > first):
             new = edge + direction * _GROWTH * self.period
             while True:
@@ -606,7 +613,11 @@ class Search:
             fit, arc, steps = self._settled(fit, arc, steps, *ends, edge if met is None else met, direction)
             state = np.concatenate([fit.values[arc.position.name], fit.values[arc.velocity.name]])
             values, edge = fit.values, new
-        return {**done, **steps}
+            good = edge if fit.square / fit.degrees < _BROKEN * self.level else good
+            if abs(edge - good) > 2 * self.period:
+                break
+        met_before = {n: m for n, m in {**done, **steps}.items() if (good - m.time) * direction > 0}
+        return met_before, good
 
     def _nodes(self, low: float, high: float) -> np.ndarray:
         return np.linspace(low, high, max(8, int((high - low) / self.period * _GRID)))
@@ -644,7 +655,8 @@ class Search:
             if test.p_value > _DOUBT and fitted:
                 break
             if test.p_value > _DOUBT:
-                fit, arc = self._scored(steps, fit, arc, low, high)[1:]
+                here = _state(fit, arc)
+                fit, arc = self.fit(low, high, arc.start, here, fit.values, steps, iterations=2, enough=1e-3)
                 break
             plain = _criterion(fit, self.shared)
             self._names += 1
@@ -702,41 +714,61 @@ class Search:
         """
         declared = self.priors
         low, high, quiet = self.quiet(state, at)
-        steps = self.grow(low, high, quiet, 1)
-        steps.update(self.grow(low, high, quiet, -1))
+        after, until = self.grow(low, high, quiet, 1)
+        before, since = self.grow(low, high, quiet, -1)
+        steps = {**after, **before}
         self.priors = declared
-        arc = _arc_of(quiet)
-        first, last = float(self.times[0]), float(self.times[-1])
-        here = _state(quiet, arc)
-        values: Mapping[str, np.ndarray] = quiet.values
-        removed = 0
-        while True:
-            self.say(f"joint fit with {len(steps)} manoeuvres")
-            fit, arc = self.fit(first, last, arc.start, here, values, steps, iterations=25, enough=1e-3)
-            here, values, steps = _state(fit, arc), fit.values, _steps_of(fit, steps)
-            if removed == 0:
-                # A burn that fell between two measurements may have been taken for an impulse at a wrong time: the same
-                # engine burns alike, so each gets a second chance from the others' duration.
-                usual = float(np.median([m.duration for m in steps.values()] or [0.0]))
-                if usual > 0.005 * self.period:
-                    steps = {n: replace(m, duration=usual) if not 0.4 * usual < m.duration < 2.5 * usual else m
-                             for n, m in steps.items()}
-                    self.say("joint fit, burns of the usual duration")
-                    again, arc2 = self.fit(first, last, arc.start, here, values, steps, iterations=25, enough=1e-3)
-                    if again.square < fit.square:
-                        fit, arc = again, arc2
-                    here, values = _state(fit, arc), fit.values
-                    steps = {n: Manoeuvre.of(fit.values[n]) for n in steps}
-            self.say(f"joint fit: {np.sqrt(fit.square / fit.degrees):.2f} times the noise of quiet data")
+        fit, arc, steps, since, until = self._joined(quiet, steps, low, high, since, until)
+        for _ in range(6):
             weak = self._weak(fit, steps)
-            if not weak or removed > 6:
+            if not weak:
                 break
-            removed += 1
             changed = {n: weak.get(n, m) for n, m in steps.items()}
-            steps = {n: m for n, m in changed.items() if m is not None}
+            kept = {n: m for n, m in changed.items() if m is not None}
+            again, new_arc = self.fit(since, until, arc.start, _state(fit, arc), fit.values, kept, iterations=15,
+                                      enough=1e-3)
+            if again.square / again.degrees > 2.0 * fit.square / fit.degrees:
+                break  # it was needed after all
+            fit, arc, steps = again, new_arc, _steps_of(again, kept)
         ordered = sorted(steps.items(), key=lambda item: item[1].time)
-        return Found(fit, arc, tuple(n for n, _ in ordered), tuple(m for _, m in ordered), dict(self.noise),
-                     self.shared, self.looks, self)
+        return Found(fit, arc, since, until, tuple(n for n, _ in ordered), tuple(m for _, m in ordered),
+                     dict(self.noise), self.shared, self.looks, self)
+
+    def _joined(self, quiet: Fit, steps: dict[str, Manoeuvre], low: float, high: float, since: float, until: float,
+                ) -> tuple[Fit, OrbitArc, dict[str, Manoeuvre], float, float]:
+        """One orbit through all data between two times, or through as much around the quiet stretch as one fits."""
+        fit, arc = quiet, _arc_of(quiet)
+        steps = dict(steps)
+        taken: dict[str, Manoeuvre] = {}
+        a, b = low, high
+        ends = {-1: since, 1: until}
+        while a > ends[-1] or b < ends[1]:
+            for direction in (1, -1):
+                edge = b if direction == 1 else a
+                new = edge + direction * _JOINED * self.period
+                new = min(new, ends[1]) if direction == 1 else max(new, ends[-1])
+                if new == edge:
+                    continue
+                tried = (a, new) if direction == 1 else (new, b)
+                inside = {n: taken.get(n, m) for n, m in steps.items() if tried[0] < m.time < tried[1]}
+                self.say(f"one orbit over {(tried[1] - tried[0]) / 86400:.1f} days, {len(inside)} manoeuvres")
+                again, new_arc = self.fit(*tried, arc.start, _state(fit, arc), fit.values, inside, iterations=12,
+                                          enough=1e-2)
+                if again.square / again.degrees > _BROKEN * self.level:
+                    ends[direction] = edge
+                    continue
+                fit, arc, taken = again, new_arc, _steps_of(again, inside)
+                a, b = tried
+        usual = float(np.median([m.duration for m in taken.values()] or [0.0]))
+        if usual > 0.005 * self.period:
+            # A burn that fell between two measurements may have been taken for an impulse at a wrong time: the same
+            # engine burns alike, so each gets a second chance from the others' duration.
+            alike = {n: replace(m, duration=usual) if not 0.4 * usual < m.duration < 2.5 * usual else m
+                     for n, m in taken.items()}
+            again, new_arc = self.fit(a, b, arc.start, _state(fit, arc), fit.values, alike, iterations=15, enough=1e-3)
+            if again.square < fit.square:
+                fit, arc, taken = again, new_arc, _steps_of(again, alike)
+        return fit, arc, taken, a, b
 
     def p_values(self, fit: Fit, names: Sequence[str]) -> dict[str, float]:
         """Probability of each manoeuvre's velocity without one, over all places where the search looked."""

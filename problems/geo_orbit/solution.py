@@ -298,6 +298,14 @@ def concluded(model: OrbitModel, estimate: Estimate, rejected: dict[str, int], s
             why.append(shift)
     if status in (Status.MODEL_GAP, Status.NOT_CONVERGED) and status is estimate.status:
         why += suspicious_stations(model, estimate)
+    if status is Status.MODEL_GAP and energy < 0 and not estimate.problem.effects:
+        axis = -3.986004418e14 / (2 * energy)
+        turns = (model.span[1] - model.span[0]) / (2 * np.pi * np.sqrt(axis**3 / 3.986004418e14))
+        if turns > 3.0:
+            why.append(
+                f"the data span {turns:.0f} revolutions, in which the satellite may have manoeuvred: "
+                "boresight orbit explain looks for manoeuvres and for everything else that the model misses"
+            )
     if rejected:
         total = sum(rejected.values())
         why.append(
