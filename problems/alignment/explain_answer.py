@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from estimator.discrepancy.gap import Gap
+from estimator.discrepancy.dependence import Dependence
+from estimator.discrepancy.empirical import EmpiricalTerm
+from estimator.discrepancy.gap import Gap, Place
 from estimator.discrepancy.proof import HeldOut
 from estimator.discrepancy.score import Score
 from estimator.discrepancy.search import Finding, Findings, Workflow
@@ -38,6 +40,9 @@ class Explanation:
         advice: the measurement that would separate an ambiguous group; None where nothing is ambiguous or nothing
             that can be asked for helps.
         seconds: wall time of everything.
+        depends_on: covariates that the disagreement with the plain model goes with.
+        left_depends_on: covariates that what is left goes with.
+        empirical: terms that carry the shape of what is left where the verdict is "unknown".
     """
 
     subject: AlignmentSubject
@@ -45,6 +50,9 @@ class Explanation:
     findings: Findings
     advice: Advice | None
     seconds: float
+    depends_on: tuple[Dependence, ...] = ()
+    left_depends_on: tuple[Dependence, ...] = ()
+    empirical: tuple[EmpiricalTerm, ...] = ()
 
     @property
     def accepted(self) -> tuple[str, ...]:
@@ -102,14 +110,56 @@ def parameters_of(estimate: Estimate, effect: EffectInstance) -> dict[str, dict[
             for p, v, s in zip(effect.parameters, values, sigma, strict=True)}
 
 
-def _places(gap: Gap) -> list[dict[str, Any]]:
+def place_sentence(place: Place, depends_on: Sequence[Dependence]) -> str:
+    """Where it is, and what it goes with."""
+    mine = [d for d in depends_on if d.channel == place.channel]
+    return "; ".join([place.sentence, *(goes_with(d, place) for d in mine)])
+
+
+def goes_with(dependence: Dependence, place: Place) -> str:
+    """The relation in words, without the components where they are those of the place."""
+    if dependence.components != place.components:
+        return dependence.sentence
+    return dependence.sentence.split(": ", 1)[1]
+
+
+def _places(gap: Gap, depends_on: Sequence[Dependence]) -> list[dict[str, Any]]:
     result = []
     for p in gap.places:
         value, unit = readable(p.excess, p.unit)
         result.append({"channel": p.channel, "arcs": list(p.arcs), "time_scale_s": p.time_scale, "unit": unit,
                        "excess": value, "floor": readable(p.floor, p.unit)[0], "components": list(p.components),
-                       "p_value": p.p_value, "sentence": p.sentence})
+                       "p_value": p.p_value, "sentence": place_sentence(p, depends_on),
+                       "depends_on": [_dependence(d) for d in depends_on if d.channel == p.channel]})
     return result
+
+
+def _dependence(d: Dependence) -> dict[str, Any]:
+    excess, unit = readable(d.excess, d.unit)
+    slope = None if d.slope is None else readable(d.slope, d.unit)[0]
+    per = "" if d.covariate_unit == "1" else f"/({d.covariate_unit})"
+    return {"covariate": d.covariate, "components": list(d.components), "form": d.form, "p_value": d.p_value,
+            "share": d.share, "excess": excess, "floor": readable(d.floor, d.unit)[0], "unit": unit, "slope": slope,
+            "slope_unit": None if slope is None else unit + per, "alike": list(d.alike), "sentence": d.sentence}
+
+
+def empirical_entry(term: EmpiricalTerm) -> dict[str, Any]:
+    """One empirical term as JSON; angles in seconds of arc."""
+
+    def shown(value: float | None) -> float | None:
+        return None if value is None or not np.isfinite(value) else readable(value, term.unit)[0]
+
+    unit = readable(1.0, term.unit)[1]
+    return {
+        "label": "EMPIRICAL", "channel": term.channel, "component": term.component, "arcs": list(term.arcs),
+        "form": term.form, "period_s": term.period, "unit": unit, "amplitude": shown(term.amplitude),
+        "sigma": shown(term.sigma), "rms": shown(term.rms), "log_odds": term.worth, "floor": shown(term.floor),
+        "fitted_before": shown(term.fitted_before), "fitted_after": shown(term.fitted_after),
+        "held_out_before": shown(term.held_out_before), "held_out_after": shown(term.held_out_after),
+        "refused": list(term.refused), "sentence": term.sentence,
+        "parameters": [{"name": p.name, "value": shown(p.value), "sigma": shown(p.sigma), "unit": unit}
+                       for p in term.parameters],
+    }
 
 
 def _line(score: Score, effect: EffectInstance) -> dict[str, Any]:
@@ -156,12 +206,12 @@ def answer_of(explanation: Explanation) -> dict[str, Any]:
     answer: dict[str, Any] = {
         "verdict": findings.verdict,
         "why": findings.why,
-        "where": _places(findings.before),
+        "where": _places(findings.before, explanation.depends_on),
         "effects": [_finding(explanation, f) for f in findings.findings],
         "next_measurement": next_measurement_sentence(explanation),
         "next_measurement_options": [] if explanation.advice is None else explanation.advice.as_list(),
         "sentences": list(three_sentences(explanation)),
-        "left": _places(findings.after),
+        "left": _places(findings.after, explanation.left_depends_on),
         "white_noise": [{"residual": name, "factor": factor} for name, factor in findings.after.white],
         "rejected": list(findings.rejected),
         "looks": findings.looks,
@@ -170,6 +220,8 @@ def answer_of(explanation: Explanation) -> dict[str, Any]:
         "hold_out": explanation.subject.hold_out,
         "seconds": explanation.seconds,
     }
+    if findings.verdict == "unknown":
+        answer["empirical"] = [empirical_entry(t) for t in explanation.empirical]
     return answer
 
 
@@ -224,7 +276,8 @@ def three_sentences(explanation: Explanation) -> tuple[str, str, str]:
 def _where(explanation: Explanation) -> str:
     before = explanation.findings.before
     if before.present:
-        return "The plain model and the data disagree in " + "; ".join(p.sentence for p in before.places) + "."
+        return "The plain model and the data disagree in " + "; ".join(
+            place_sentence(p, explanation.depends_on) for p in before.places) + "."
     if before.white:
         noise = _listed([f"{name.replace('_', ' ')} by a factor {factor:.2f}" for name, factor in before.white])
         return f"The residuals show no structure, but white noise above the declared one: {noise}."
@@ -257,7 +310,7 @@ def _proof(explanation: Explanation) -> str:
     findings = explanation.findings
     if not findings.findings:
         if findings.after.present:
-            return "Unexplained remains " + "; ".join(p.sentence for p in findings.after.places) + "."
+            return "Unexplained remains " + _left(explanation) + "."
         if findings.verdict == "unknown":
             return "Declare the larger noise and ask again."
         return "Nothing was added, so there is nothing to prove."
@@ -272,8 +325,12 @@ def _proof(explanation: Explanation) -> str:
         largest = sorted(moved.items(), key=lambda item: -item[1])[:3]
         sentence += "; the fit without it had moved " + _listed([f"{n} by {s:.1f} sigma" for n, s in largest])
     if findings.after.present:
-        sentence += "; still unexplained is " + "; ".join(p.sentence for p in findings.after.places)
+        sentence += "; still unexplained is " + _left(explanation)
     return sentence + "."
+
+
+def _left(explanation: Explanation) -> str:
+    return "; ".join(place_sentence(p, explanation.left_depends_on) for p in explanation.findings.after.places)
 
 
 def next_measurement_sentence(explanation: Explanation) -> str:
@@ -310,6 +367,11 @@ def text_of(explanation: Explanation) -> str:
             for name, p in parameters_of(findings.final, explanation.instance(f.name)).items():
                 sigma = "-" if p["sigma"] is None else f"{p['sigma']:.3g}"
                 lines.append(f"{f.name + ' ' + name:<50}{p['value']:>16.6g}{sigma:>14}  {p['unit']}")
+    if explanation.empirical:
+        lines += ["", "the shape of what is left", *(f"  {t.sentence}" for t in explanation.empirical)]
+    elif findings.after.present:
+        lines += ["", "the shape of what is left: no simple empirical term (constants, curves or periods) is worth its "
+                      "parameters"]
     if findings.tables and findings.tables[0]:
         lines += ["", "scores at the plain model", f"{'effect':<34}{'score':>10}{'degrees':>9}{'p':>10}{'power':>8}"]
         for s in findings.tables[0][:8]:

@@ -5,6 +5,9 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 
+from estimator.discrepancy.dependence import Dependence, dependences
+from estimator.discrepancy.empirical import EmpiricalTerm, empirical_terms
+from estimator.discrepancy.gap import Gap
 from estimator.discrepancy.search import Say, Workflow
 from estimator.models.errors import RequestError
 from problems.alignment.campaign import Campaign
@@ -28,6 +31,7 @@ def explained(campaign: Campaign, *, hold_out: float = 0.2, without: Sequence[st
         InputError: data that cannot be used.
     """
     began = time.perf_counter()
+    say = say or (lambda text: None)
     subject = AlignmentSubject(campaign, hold_out, tuple(without), tuple(effects_places))
     _check(without, effects_places)
     workflow = Workflow(subject, say)
@@ -36,13 +40,32 @@ def explained(campaign: Campaign, *, hold_out: float = 0.2, without: Sequence[st
     if findings.verdict == "ambiguous":
         from problems.alignment.next_measurement import advise
 
-        (say or (lambda text: None))("which measurement would separate the group")
+        say("which measurement would separate the group")
         group = max((f for f in findings.findings if len(f.group) > 1), key=lambda f: len(f.group))
-        accepted = [f.name for f in findings.findings]
-        rest = [n for n in accepted if n != group.name]
+        rest = [f.name for f in findings.findings if f.name != group.name]
         sizes = {name: workflow.fit((*rest, name)).estimate.values for name in group.group}
         advice = advise(subject.everything, group.group, rest, sizes)
-    return Explanation(subject, workflow, findings, advice, time.perf_counter() - began)
+    say("what the disagreement goes with")
+    accepted = tuple(f.name for f in findings.findings)
+    before = _depends_on(workflow, subject, (), findings.before)
+    left = _depends_on(workflow, subject, accepted, findings.after) if accepted else before
+    empirical: tuple[EmpiricalTerm, ...] = ()
+    if findings.verdict == "unknown" and findings.after.present:
+        say("the shape of what is left")
+        here = workflow.round(accepted)
+        empirical = empirical_terms(here.problem, here.parts, here.stacked, findings.after)
+    return Explanation(subject, workflow, findings, advice, time.perf_counter() - began, before, left, empirical)
+
+
+def _depends_on(workflow: Workflow, subject: AlignmentSubject, effects: Sequence[str], gap: Gap,
+                ) -> tuple[Dependence, ...]:
+    """What the disagreement of each channel of a gap goes with, beside the model with these effects."""
+    if not gap.present:
+        return ()
+    here = workflow.round(effects)
+    channels = dict.fromkeys(p.channel for p in gap.places)
+    return tuple(d for c in channels
+                 for d in dependences(here.problem, here.parts, here.stacked, c, subject.covariates))
 
 
 def _check(without: Sequence[str], places: Sequence[str]) -> None:

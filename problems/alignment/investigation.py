@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
+
+from estimator.discrepancy.dependence import Covariate
 from estimator.discrepancy.search import Findings, Say, explain
 from estimator.effects.declaration import EffectInstance
 from estimator.problem import Problem
@@ -68,6 +71,12 @@ class AlignmentSubject:
                            if e.channel in ("torque", "command") and not (e.state_size and e.channel == "torque"))
         return alignment_problem(self.training if hold_out else self.everything, effects, candidates=candidates,
                                  in_equation=shared)
+
+    def covariates(self, channel: str, time: np.ndarray) -> Mapping[str, Covariate]:
+        """See :func:`problems.alignment.covariates.campaign_covariates`."""
+        from problems.alignment.covariates import campaign_covariates
+
+        return campaign_covariates(self.everything, channel, time)
 
     def _channel(self, name: str) -> str:
         return next(e.channel for e in self.library if name in (e.name, e.family))

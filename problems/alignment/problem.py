@@ -318,6 +318,15 @@ class AlignmentModel:
                 rate[inside] = curve.rate(np.clip(time[inside], curve.start, curve.stop))
         return rate
 
+    def smooth_attitude(self, time: np.ndarray) -> np.ndarray:
+        """Smoothed ``tracker_from_inertial`` (n, 4) at the times (n) s; NaN outside the arcs' tracker data."""
+        quaternion = np.full((len(time), 4), np.nan)
+        for curve in self._curves:
+            inside = (time >= curve.start - 1e-6) & (time <= curve.stop + 1e-6)
+            if inside.any():
+                quaternion[inside] = curve.quaternion(np.clip(time[inside], curve.start, curve.stop))
+        return quaternion
+
     def environment(self, time: np.ndarray) -> np.ndarray:
         """Table (n, rows) of everything about the environment that an effect may depend on, along the orbit."""
         from scipy.spatial.transform import Rotation
