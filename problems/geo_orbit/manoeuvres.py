@@ -10,9 +10,9 @@ metres can be seen before these velocity steps are in the model. :func:`find_man
    likelihood ratio test, Willsky and Jones 1976). Where the best u is significant, the step's time and velocity are
    refined with everything else, and so is the length of the burn. A step of the wrong time is moved before a second
    one is added.
-3. One joint fit of all data: one orbit, all manoeuvres with their times, the calibration of the stations. What is not
-   significant there leaves, what is missing is looked for again on all data, and the probability of a false name after
-   all these looks is stated.
+3. One joint fit: one orbit, all manoeuvres with their times, the calibration of the stations, extended from the quiet
+   stretch as far as one orbit fits. What is not significant there leaves, and the probability of a false name after all
+   places that were tried is stated.
 
 One continuous orbit is fitted rather than independent arcs: a manoeuvre changes the velocity only, so that each costs
 four numbers instead of six and the positions before and after bind each other. Between steps the model of the forces is
