@@ -148,7 +148,12 @@ def test_both_beams_together_and_a_second_covariate_beside_the_first() -> None:
     rate = 0.01 * np.sin(2 * np.pi * (TIME - 1800.0 * LABEL) / 90.0 + 1.7 * LABEL)
     measured = noise(draw)
     measured[:, 1] += 0.1 * (temperature(TIME) - 280.0) + 80.0 * rate
-    both = {d.covariate for d in told(measured)}
+
+    def without_phase(channel: str, time: np.ndarray) -> Mapping[str, Covariate]:
+        # Over 12 arcs a phase of 6000 s copies a temperature of 5900 s well enough to be taken for it.
+        return {n: c for n, c in covariates(channel, time).items() if n != "orbit_phase"}
+
+    both = {d.covariate for d in told(measured, without_phase)}
     assert both == {"antenna_temperature", "body_rate"}
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from estimator.discrepancy.gap import Gap
+from estimator.discrepancy.dependence import Dependence
 from estimator.discrepancy.score import Score, on_rows, signature
 from estimator.discrepancy.search import Finding, Workflow
 from estimator.effects.declaration import EffectInstance
@@ -39,6 +39,8 @@ CLOUD = 2500  # raw samples behind a curve
 COMPONENT_COLOURS = ("#2166ac", "#d6604d", "#4d9221", "#8073ac", "#b8860b", "#35978f")
 BEFORE, AFTER = "#b2182b", "#2166ac"
 CHANNEL_TITLES = {"doppler": "Doppler shift", "star_tracker": "star tracker", "gnss": "positions"}
+FORMS = {"constant": "one constant per arc", "smooth": "a smooth curve per arc", "periodic": "periodic, one phase",
+         "periodic by arc": "periodic, a phase per arc"}
 VERDICTS = {
     "quiet": ("quiet", "#1b7837", "nothing is missing"),
     "named": ("named", "#2166ac", "the missing effect has a name"),
@@ -381,9 +383,10 @@ def page_of(explanation: Explanation, source: str = "") -> str:
              ("Doppler shifts", f"{doppler:,}"), ("arcs", f"{len(campaign.arcs)}"),
              ("candidates", f"{len(explanation.workflow.library)}"), ("kept for the proof",
                                                                      f"{100 * explanation.subject.hold_out:.0f} %")]
-    sections = [_findings_section(explanation), _where_section(findings.before, findings.after),
+    sections = [_findings_section(explanation), _where_section(explanation), _empirical_section(explanation),
                 _scores_section(explanation), _imitation_section(explanation), _next_section(explanation),
                 _reading_section(explanation)]
+    empirical = '<a href="#empirical">Shape of the rest</a>' if 'id="empirical"' in "".join(sections) else ""
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
 <meta http-equiv="Content-Security-Policy" content="default-src 'none'; style-src 'unsafe-inline'; img-src data:">
@@ -395,7 +398,7 @@ def page_of(explanation: Explanation, source: str = "") -> str:
 <p><b>Where</b> {_e(where)}</p><p><b>What</b> {_e(what)}</p><p><b>Proof</b> {_e(proof)}</p>
 <p><b>Next</b> {_e(_sentence(next_measurement_sentence(explanation)))}</p></div>
 <div class="facts">{"".join(f"<div><b>{v}</b><span class='soft small'>{_e(k)}</span></div>" for k, v in facts)}</div>
-<nav><a href="#findings">Effects</a><a href="#where">Where</a><a href="#scores">Scores</a>
+<nav><a href="#findings">Effects</a><a href="#where">Where</a>{empirical}<a href="#scores">Scores</a>
 <a href="#alike">Look-alikes</a><a href="#next">Next measurement</a><a href="#reading">How to read</a></nav>
 {"".join(sections)}
 </main></body></html>
@@ -482,9 +485,12 @@ def _probability(p: float) -> str:
     return "below 1e-12" if p < 1e-12 else f"{p:.1e}" if p < 0.001 else f"{p:.3f}"
 
 
-def _where_section(before: Gap, after: Gap) -> str:
+def _where_section(explanation: Explanation) -> str:
+    findings = explanation.findings
     parts = ['<h2 id="where">Where model and data disagree</h2>']
-    for word, gap in (("Before, with the plain model", before), ("Left, with the effects that were added", after)):
+    for word, gap, depends_on in (("Before, with the plain model", findings.before, explanation.depends_on),
+                                  ("Left, with the effects that were added", findings.after,
+                                   explanation.left_depends_on)):
         parts.append(f"<h3>{word}</h3>")
         if not gap.present:
             parts.append("<p>Nowhere: in every arc and component the residuals are noise"
@@ -501,9 +507,68 @@ def _where_section(before: Gap, after: Gap) -> str:
             parts.append(_table([("channel", False), ("arcs", False), ("components", False), ("structure, RMS", True),
                                  ("noise", True), ("changes within", True), ("probability", True),
                                  ("in words", False)], rows))
+            parts.append(_depends_on(depends_on))
         if gap.white:
             parts.append("<p>White noise above the declared one: " + ", ".join(
                 f"{_e(name.replace('_', ' '))} {factor:.2f} times" for name, factor in gap.white) + ".</p>")
+    return "".join(parts)
+
+
+def _depends_on(depends_on: Sequence[Dependence]) -> str:
+    """What the disagreement goes with, as a table."""
+    if not depends_on:
+        return ("<p>It goes with none of the covariates that were tried (time, orbit phase, sunlight, rate, look "
+                "direction, frequency, housekeeping) more than chance and plain time inside the arcs allow.</p>")
+    rows = []
+    for d in depends_on:
+        excess, unit = readable(d.excess, d.unit)
+        slope = "" if d.slope is None else f"{readable(d.slope, d.unit)[0]:.4g} {unit}"
+        slope += f" per {d.covariate_unit}" if slope and d.covariate_unit != "1" else ""
+        rows.append(("", [_e(CHANNEL_TITLES.get(d.channel, d.channel)), ", ".join(str(c) for c in d.components),
+                          f"<b>{_e(d.covariate)}</b>", _e(d.form), _e(slope), f"{excess:.4g} {_e(unit)}",
+                          f"{100 * d.share:.0f} %", _probability(d.p_value), _e(", ".join(d.alike))]))
+    return "<p>What it goes with:</p>" + _table(
+        [("channel", False), ("components", False), ("covariate", False), ("form", False), ("slope", True),
+         ("RMS", True), ("share of the excess", True), ("probability", True), ("as well with", False)], rows)
+
+
+def _empirical_section(explanation: Explanation) -> str:
+    """The shape of what no effect explains, and how far it carries the gap."""
+    if explanation.findings.verdict != "unknown" or not explanation.findings.after.present:
+        return ""
+    parts = ['<h2 id="empirical">The shape of what is left</h2>',
+             '<p><span class="verdict" style="background:#b35806">EMPIRICAL</span> not a name: these terms carry the '
+             "structure that no effect of the library explains. They say how it looks, not what it is, and are not in "
+             "the estimate.</p>"]
+    if not explanation.empirical:
+        return "".join([*parts, "<p>No constants, curves or periods are worth their parameters.</p>"])
+    rows = []
+    for t in explanation.empirical:
+        unit = readable(1.0, t.unit)[1]
+
+        def shown(value: float | None, given: str = t.unit) -> str:
+            return "-" if value is None else f"{readable(value, given)[0]:.4g}"
+
+        which = f"beam {t.component}" if t.channel == "doppler" else f"axis {'xyz'[t.component % 3]}"
+        size = number(t.amplitude, t.sigma, t.unit)
+        rows.append(("", [f"{_e(CHANNEL_TITLES.get(t.channel, t.channel))}, {_e(which)}", _e(FORMS[t.form]),
+                          "" if t.period is None else f"{t.period:.5g} s", _e(size), shown(t.rms),
+                          shown(t.fitted_before), shown(t.fitted_after), shown(t.held_out_before),
+                          shown(t.held_out_after), shown(t.floor), _e(unit)]))
+    parts.append(_table([("where", False), ("form", False), ("period", True), ("size", True), ("RMS", True),
+                         ("fitted, before", True), ("after", True), ("held out, before", True), ("after", True),
+                         ("noise", True), ("unit", False)], rows))
+    if any(t.held_out_after is None and t.held_out_before is not None for t in explanation.empirical):
+        parts.append('<p class="soft small">A dash: a curve of one arc cannot be carried on to the end of the arc that '
+                     "was held out, so it is not proved there.</p>")
+    for t in explanation.empirical:
+        if t.refused:
+            parts.append(f'<p class="soft small">Turned down in {_e(CHANNEL_TITLES.get(t.channel, t.channel))} because '
+                         f"held-out data were predicted worse: {_e(', '.join(FORMS[f] for f in t.refused))}.</p>")
+        parameters = [("", [_e(p.name), _e(number(p.value, p.sigma, p.unit))]) for p in t.parameters]
+        parts.append(f"<details><summary>{len(parameters)} parameters of the term in "
+                     f"{_e(CHANNEL_TITLES.get(t.channel, t.channel))}, component {t.component}</summary>"
+                     + _table([("parameter", False), ("value", False)], parameters) + "</details>")
     return "".join(parts)
 
 
