@@ -75,7 +75,8 @@ class Dependence:
         p_value: over all covariates, functions, strata and components of the channel.
         share: part of the channel's excess, about a constant and plain time inside the arcs, that goes with the
             covariate (0 to 1).
-        excess: root mean square of what goes with the covariate, in ``unit``, about its mean.
+        excess: root mean square of what goes with the covariate, in ``unit``, about its mean, the other unknowns
+            giving way.
         floor: root mean square of the noise there.
         unit: of the channel.
         slope: change per unit of the covariate where the form is linear, else None.
@@ -130,7 +131,6 @@ class _Relation:
     form: str
     p_value: float
     designs: Sequence[np.ndarray]
-    functions: np.ndarray
     spread: float
 
     @property
@@ -265,7 +265,6 @@ def _relations(reduced: _Reduced, name: str, covariate: Covariate, values: np.nd
                 tests += made
                 smallest = min(smallest, p)
             found.append(_Relation(reduced, group, name, covariate.unit, form, smallest, joined,
-                                   np.stack([forms[c][form] for c in group], axis=1),
                                    float(np.std(values[:, group[0]]))))
     return found, tests
 
@@ -378,11 +377,10 @@ def _told(named: Sequence[tuple[_Relation, tuple[str, ...]]], channel: str, widt
         total = sum(float(y @ y) - max(len(y) - b.shape[1], 0)
                     for y, b in zip(reduced.numbers, reduced.common, strict=True))
         share = float(np.clip((drop - len(size)) / max(total, 1e-12), 0.0, 1.0))
-        sizes = size.reshape(len(shown), -1)
-        shape = np.einsum("nck,ck->nc", relation.functions, sizes)
-        shape = shape - shape.mean(axis=0)
-        excess, floor = float(np.sqrt(np.mean(shape**2))), float(np.sqrt(np.mean(noise[list(shown)] ** 2)))
-        slope = float(sizes[0, 0]) / relation.spread if relation.form == "linear" and len(shown) == 1 else None
+        # What shows in the data, the other unknowns giving way: a part that they take up has no size that is known.
+        felt = sum(float(np.sum(a.response[:, :, list(shown)] ** 2)) for a in arcs)
+        excess, floor = float(np.sqrt(drop / felt)), float(np.sqrt(np.mean(noise[list(shown)] ** 2)))
+        slope = float(size[0]) / relation.spread if relation.form == "linear" and len(shown) == 1 else None
         verb = "varies with" if slope is None else "grows with" if slope > 0 else "falls with"
         parts = ("all " + ("beams" if which == "beam" else "axes") if len(shown) == width > 1 else
                  f"{which} " + ", ".join(str(c) for c in shown))

@@ -14,7 +14,7 @@ it carries the gap, it explains nothing.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
@@ -27,7 +27,7 @@ from estimator.residuals import KernelResidual, Linearization
 
 DEGREES = (1, 2, 3, 5, 7)  # of the curve of an arc
 HARMONICS = 3
-UNDETERMINED = 1e-3  # part of a column's square beside the fit below which its size is not determined
+UNDETERMINED = 1e-2  # part of a function's square beside the fit below which its size is not determined
 SIMPLER = 4.6  # log odds (100 to 1) by which a form that predicts nothing must be worth more than one that predicts
 FEWEST = 16  # samples of an arc that takes part
 CHUNK = 2_000_000  # values of a table of waves at a time
@@ -59,7 +59,7 @@ class EmpiricalTerm:
         amplitude: of the fundamental, its root mean square over arcs where each has its own; of the other forms the
             root mean square of the constants and the largest size of the curves.
         sigma: standard deviation of the amplitude under the declared noise.
-        rms: root mean square of the term over the fitted samples.
+        rms: root mean square over the fitted samples of what the term changes, the other unknowns giving way.
         worth: log odds against no term.
         parameters: every fitted number.
         floor: root mean square of the noise of the component.
@@ -68,6 +68,8 @@ class EmpiricalTerm:
             reach them, both where there are none.
         refused: forms worth more in the fit that predicted the held-out samples worse than nothing.
         sentence: all this in words.
+        samples: (n, 4) time (s), residual of the component without the term and with it (decorrelated, in ``unit``),
+            and 1 for a fitted sample, 0 for one held out.
     """
 
     channel: str
@@ -88,6 +90,7 @@ class EmpiricalTerm:
     held_out_after: float | None
     refused: tuple[str, ...]
     sentence: str
+    samples: np.ndarray = field(compare=False, repr=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,7 +323,9 @@ def _told(bench: _Bench, place: Place, fit: _Fit, refused: tuple[str, ...]) -> E
         parameters.append(EmpiricalParameter(name, float(value), float(spread), unit))
     amplitude, error = _amplitude(arcs, fit, per_arc)
     fitted = [a.fitted for a in arcs]
-    rms = float(np.sqrt(np.mean(np.concatenate([s[m] for s, m in zip(fit.signal, fitted, strict=True)]) ** 2)))
+    changed = sum(float(np.sum((a.whitened - after)[a.fitted] ** 2)) for a, after in zip(arcs, fit.after, strict=True))
+    felt = sum(float(np.sum(spread[a.fitted] ** 2)) for a, spread in zip(arcs, bench.spread, strict=True))
+    rms = float(np.sqrt(changed / felt))
 
     def miss(values: Sequence[np.ndarray], masks: Sequence[np.ndarray]) -> float | None:
         chosen = np.concatenate([v[m, k] for v, m in zip(values, masks, strict=True)])
@@ -334,7 +339,14 @@ def _told(bench: _Bench, place: Place, fit: _Fit, refused: tuple[str, ...]) -> E
     fourth = miss(fit.after, kept) if fit.reaches else None
     sentence = _sentence(place, k, fit, unit, amplitude, error, rms, (first, second, third, fourth), noise)
     return EmpiricalTerm(place.channel, k, tuple(a.arc for a in arcs), form.name, form.period, unit, amplitude, error,
-                         rms, fit.worth, tuple(parameters), noise, first, second, third, fourth, refused, sentence)
+                         rms, fit.worth, tuple(parameters), noise, first, second, third, fourth, refused, sentence,
+                         _samples(bench, fit.after))
+
+
+def _samples(bench: _Bench, after: Sequence[np.ndarray]) -> np.ndarray:
+    k, noise = bench.component, float(bench.arcs[0].noise[bench.component])
+    return np.concatenate([np.column_stack([a.time, noise * a.whitened[:, k], noise * rest[:, k], a.fitted])
+                           for a, rest in zip(bench.arcs, after, strict=True)])
 
 
 def _amplitude(arcs: Sequence[ArcSeries], fit: _Fit, per_arc: int) -> tuple[float, float]:

@@ -310,7 +310,7 @@ def _proof(explanation: Explanation) -> str:
     findings = explanation.findings
     if not findings.findings:
         if findings.after.present:
-            return "Unexplained remains " + _left(explanation) + "."
+            return "Unexplained remains all of it" + _carried(explanation) + "."
         if findings.verdict == "unknown":
             return "Declare the larger noise and ask again."
         return "Nothing was added, so there is nothing to prove."
@@ -325,8 +325,16 @@ def _proof(explanation: Explanation) -> str:
         largest = sorted(moved.items(), key=lambda item: -item[1])[:3]
         sentence += "; the fit without it had moved " + _listed([f"{n} by {s:.1f} sigma" for n, s in largest])
     if findings.after.present:
-        sentence += "; still unexplained is " + _left(explanation)
+        sentence += "; still unexplained is " + _left(explanation) + _carried(explanation)
     return sentence + "."
+
+
+def _carried(explanation: Explanation) -> str:
+    terms = explanation.empirical
+    if not terms:
+        return ""
+    rest = f", and {len(terms) - 2} more" if len(terms) > 2 else ""
+    return "; its shape, " + "; ".join(t.sentence for t in terms[:2]) + rest
 
 
 def _left(explanation: Explanation) -> str:
@@ -342,7 +350,13 @@ def next_measurement_sentence(explanation: Explanation) -> str:
         return "no free rotation, torque pulse or Doppler pass that could be asked for separates the group"
     if findings.after.present:
         place = findings.after.places[0]
-        arcs = "every arc" if len(place.arcs) > 4 else "arcs " + ", ".join(place.arcs)
+        everywhere = len(place.arcs) > 4 or place.arcs[0].startswith("all ")
+        arcs = "every arc" if everywhere else "arcs " + ", ".join(place.arcs)
+        mine = [d for d in explanation.left_depends_on if d.channel == place.channel]
+        if mine:
+            beside = f", {_listed(mine[0].alike)} as they are now" if mine[0].alike else ""
+            return (f"repeat {arcs} ({place.channel.replace('_', ' ')}) at other values of {mine[0].covariate}{beside}: "
+                    "whether the miss follows says whether the relation is one of cause")
         return (f"repeat {arcs} ({place.channel.replace('_', ' ')}) at another time of day and with another attitude: "
                 "whether the shape returns with the clock, the orbit or the attitude says what kind of effect it is")
     if findings.verdict == "unknown":

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from estimator.discrepancy.dependence import Dependence
+from estimator.discrepancy.empirical import EmpiricalTerm
 from estimator.discrepancy.score import Score, on_rows, signature
 from estimator.discrepancy.search import Finding, Workflow
 from estimator.effects.declaration import EffectInstance
@@ -166,8 +167,10 @@ def binned(item: Trace, values: np.ndarray, mask: np.ndarray, bins: int = BINS) 
             continue
         count = max(3, round(bins * (stop - start) / total))
         label = np.minimum(((item.place[inside] - start) / max(stop - start, 1e-12) * count).astype(int), count - 1)
-        filled = np.unique(label)
-        weight = np.bincount(label, minlength=count)[filled]
+        weight = np.bincount(label, minlength=count)
+        # The mean of a handful of samples at a ragged end is noise that looks like a peak.
+        filled = np.flatnonzero(weight >= min(FEWEST_IN_BIN // 3, int(weight.max())))
+        weight = weight[filled]
         places += [np.bincount(label, item.place[inside], count)[filled] / weight, np.array([np.nan])]
         columns = [np.bincount(label, column, count)[filled] / weight for column in values[inside].T]
         means += [np.column_stack(columns), np.full((1, values.shape[1]), np.nan)]
@@ -250,10 +253,10 @@ def _held_out(axes: Any, item: Trace, proof: dict[str, Any] | None) -> None:
     low, high = axes.get_ylim()
     largest = 1.25 * max(abs(low), abs(high))
     axes.set_ylim(-largest, largest)
-    words = f"held out, {item.names[strongest]}"
+    axes.set_title(f"held out, {item.names[strongest]}")
     if proof is not None:
-        words += f"; all: {proof['before']:.3g} to {proof['after']:.3g} {proof['unit']} (floor {proof['floor']:.3g})"
-    axes.set_title(words)
+        axes.text(0.02, 0.02, f"all: {proof['before']:.3g} to {proof['after']:.3g} {proof['unit']}, "
+                  f"floor {proof['floor']:.3g}", transform=axes.transAxes, fontsize=7, color="#333", va="bottom")
     _arcs(axes, item)
 
 
@@ -264,6 +267,58 @@ def _arcs(axes: Any, item: Trace) -> None:
             axes.axvspan(start, stop, color="#f2f2f2", zorder=-1, lw=0)
     axes.set_xlim(item.edges[0][0], item.edges[-1][1])
     axes.set_xlabel("minutes of data, arcs side by side" if len(item.edges) > 1 else "minutes of data")
+
+
+def empirical_figure(term: EmpiricalTerm) -> str:
+    """Residuals without and with an empirical term over the data and, where it repeats, over its period; as SVG."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    factor, unit = readable(1.0, term.unit)
+    time, before, after = term.samples[:, 0], factor * term.samples[:, 1], factor * term.samples[:, 2]
+    fitted = term.samples[:, 3] > 0
+    step = float(np.median(np.diff(time)))
+    arc = np.concatenate([[0], np.cumsum(np.diff(time) > 20 * step)])
+    place, edges, start = np.zeros(len(time)), [], 0.0
+    for k in range(int(arc[-1]) + 1):
+        inside = arc == k
+        place[inside] = start + (time[inside] - time[inside][0]) / 60
+        edges.append((start, float(place[inside][-1]), ""))
+        start = edges[-1][1] + 0.6 * step
+    item = Trace(term.channel, unit, place, arc, tuple(edges), before[:, None], after[:, None], fitted,
+                 np.array([factor * term.floor]))
+    periodic = term.period is not None and term.form == "periodic"
+    with plt.rc_context(_style()):
+        figure, grid = plt.subplots(1, 3 if periodic else 2, figsize=(14.2 if periodic else 9.6, 2.9), squeeze=False,
+                                    gridspec_kw={"wspace": 0.24})
+        for axes, mask, word in ((grid[0, 0], fitted, "fitted"), (grid[0, 1], ~fitted, "held out")):
+            axes.set_title(f"{word} samples")
+            for values, colour, name in ((item.before, BEFORE, "as it is"), (item.after, AFTER, "with the term")):
+                if word == "held out" and term.held_out_after is None and name == "with the term":
+                    continue
+                where, means = binned(item, values, mask)
+                axes.plot(where, means[:, 0], ".-", ms=2.5, lw=0.8, color=colour, label=name)
+            _arcs(axes, item)
+        if periodic:
+            assert term.period is not None
+            axes = grid[0, 2]
+            axes.set_title(f"all samples over {term.period:.4g} s")
+            phase = (time / term.period) % 1.0
+            label = np.minimum((phase * 24).astype(int), 23)
+            middle = (np.arange(24) + 0.5) / 24 * term.period
+            count = np.maximum(np.bincount(label, minlength=24), 1)
+            for values, colour in ((before, BEFORE), (after, AFTER)):
+                axes.errorbar(middle, np.bincount(label, values, 24) / count, factor * term.floor / np.sqrt(count),
+                              fmt=".-", ms=3, lw=0.8, color=colour)
+            axes.axhline(0, color="#999", lw=0.6, zorder=0)
+            axes.set_xlabel("seconds within the period")
+        grid[0, 0].set_ylabel(f"residual [{unit}]")
+        low, high = grid[0, 0].get_ylim()
+        grid[0, 0].set_ylim(low, high + 0.15 * (high - low))  # room for the legend
+        grid[0, 0].legend(fontsize=7, frameon=False, loc="upper left", ncols=2, borderaxespad=0.1, handlelength=1.2)
+        return _svg(figure)
 
 
 def imitation(workflow: Workflow, most: int = 12) -> tuple[list[str], np.ndarray]:
@@ -345,7 +400,7 @@ h1 { font-size:26px; margin:0 0 4px } h2 { font-size:19px; margin:44px 0 10px; p
 table { border-collapse:collapse; margin:8px 0 14px; width:100%; font-size:13.5px; font-variant-numeric:tabular-nums }
 th { text-align:left; font-weight:600; color:var(--soft); border-bottom:1.5px solid #b9c2cc; padding:4px 10px 4px 0;
   vertical-align:bottom } td { border-bottom:1px solid var(--line); padding:4px 10px 4px 0; vertical-align:top }
-td.n, th.n { text-align:right; white-space:nowrap } tr.found td { background:#eef4fb; font-weight:600 }
+td:first-child { white-space:nowrap } td.n, th.n { text-align:right; white-space:nowrap } tr.found td { background:#eef4fb; font-weight:600 }
 tr.dim td { color:var(--soft) } figure { margin:10px 0 4px; overflow-x:auto } figure svg { max-width:100%; height:auto }
 figcaption { color:var(--soft); font-size:13px; margin-top:2px; max-width:1000px }
 .facts { display:flex; gap:30px; flex-wrap:wrap; margin:10px 0 0 } .facts div { min-width:110px }
@@ -450,15 +505,15 @@ def _finding_block(explanation: Explanation, finding: Finding, before: Sequence[
         rows.append(("", [_e(p.name), _e(number(got["value"], got["sigma"], p.unit)),
                           _e(number(float(finding.expected.size[i]), float(expected_sigma), p.unit))
                           if p.search is None else f"{finding.expected.size[i]:.4g} {_e(p.unit)} (tried)",
-                          f"{p.plausible[0]:.3g} to {p.plausible[1]:.3g} {_e('' if p.unit == '1' else p.unit)}",
+                          _range(p.plausible, p.unit),
                           "" if p.nominal is None else f"{p.nominal:g}"]))
-    shown = rows if len(rows) <= 12 else rows[:12]
-    block.append(_table([("parameter", False), ("joint fit of all data", False), ("predicted by the score", False),
-                         ("plausible", False), ("demanded by physics", False)], shown))
+    head = [("parameter", False), ("joint fit of all data", False), ("predicted by the score", False),
+            ("plausible", False), ("demanded by physics", False)]
+    if all(p.nominal is None for p in effect.parameters):
+        head, rows = head[:-1], [(kind, cells[:-1]) for kind, cells in rows]
+    block.append(_table(head, rows[:12]))
     if len(rows) > 12:
-        block.append(f"<details><summary>{len(rows) - 12} more parameters</summary>" + _table(
-            [("parameter", False), ("joint fit of all data", False), ("predicted by the score", False),
-             ("plausible", False), ("demanded by physics", False)], rows[12:]) + "</details>")
+        block.append(f"<details><summary>{len(rows) - 12} more parameters</summary>{_table(head, rows[12:])}</details>")
     proof_rows = []
     inside = physical(finding.gap_before, finding.gap_after, list(finding.held_out_before))
     kept = physical(finding.held_out_before, finding.held_out_after, list(finding.held_out_before))
@@ -481,6 +536,11 @@ def _finding_block(explanation: Explanation, finding: Finding, before: Sequence[
     return "".join(block)
 
 
+def _range(limits: tuple[float, float], unit: str) -> str:
+    low, shown = readable(limits[0], unit)
+    return f"{low:.4g} to {readable(limits[1], unit)[0]:.4g} {_e('' if shown == '1' else shown)}"
+
+
 def _probability(p: float) -> str:
     return "below 1e-12" if p < 1e-12 else f"{p:.1e}" if p < 0.001 else f"{p:.3f}"
 
@@ -492,6 +552,9 @@ def _where_section(explanation: Explanation) -> str:
                                   ("Left, with the effects that were added", findings.after,
                                    explanation.left_depends_on)):
         parts.append(f"<h3>{word}</h3>")
+        if gap is findings.after and gap.present and not findings.findings:
+            parts.append("<p>All of it: no effect was added.</p>")
+            continue
         if not gap.present:
             parts.append("<p>Nowhere: in every arc and component the residuals are noise"
                          f" (smallest probability over all places {_probability(gap.p_value)}).</p>")
@@ -562,6 +625,7 @@ def _empirical_section(explanation: Explanation) -> str:
         parts.append('<p class="soft small">A dash: a curve of one arc cannot be carried on to the end of the arc that '
                      "was held out, so it is not proved there.</p>")
     for t in explanation.empirical:
+        parts.append(f"<figure>{empirical_figure(t)}<figcaption>{_e(t.sentence)}.</figcaption></figure>")
         if t.refused:
             parts.append(f'<p class="soft small">Turned down in {_e(CHANNEL_TITLES.get(t.channel, t.channel))} because '
                          f"held-out data were predicted worse: {_e(', '.join(FORMS[f] for f in t.refused))}.</p>")
