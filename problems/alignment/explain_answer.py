@@ -355,8 +355,8 @@ def next_measurement_sentence(explanation: Explanation) -> str:
         mine = [d for d in explanation.left_depends_on if d.channel == place.channel]
         if mine:
             beside = f", {_listed(mine[0].alike)} as they are now" if mine[0].alike else ""
-            return (f"repeat {arcs} ({place.channel.replace('_', ' ')}) at other values of {mine[0].covariate}{beside}: "
-                    "whether the miss follows says whether the relation is one of cause")
+            return (f"repeat {arcs} ({place.channel.replace('_', ' ')}) at other values of {mine[0].covariate}{beside}"
+                    ": whether the miss follows says whether the relation is one of cause")
         return (f"repeat {arcs} ({place.channel.replace('_', ' ')}) at another time of day and with another attitude: "
                 "whether the shape returns with the clock, the orbit or the attitude says what kind of effect it is")
     if findings.verdict == "unknown":

@@ -400,7 +400,8 @@ h1 { font-size:26px; margin:0 0 4px } h2 { font-size:19px; margin:44px 0 10px; p
 table { border-collapse:collapse; margin:8px 0 14px; width:100%; font-size:13.5px; font-variant-numeric:tabular-nums }
 th { text-align:left; font-weight:600; color:var(--soft); border-bottom:1.5px solid #b9c2cc; padding:4px 10px 4px 0;
   vertical-align:bottom } td { border-bottom:1px solid var(--line); padding:4px 10px 4px 0; vertical-align:top }
-td:first-child { white-space:nowrap } td.n, th.n { text-align:right; white-space:nowrap } tr.found td { background:#eef4fb; font-weight:600 }
+td:first-child { white-space:nowrap }
+td.n, th.n { text-align:right; white-space:nowrap } tr.found td { background:#eef4fb; font-weight:600 }
 tr.dim td { color:var(--soft) } figure { margin:10px 0 4px; overflow-x:auto } figure svg { max-width:100%; height:auto }
 figcaption { color:var(--soft); font-size:13px; margin-top:2px; max-width:1000px }
 .facts { display:flex; gap:30px; flex-wrap:wrap; margin:10px 0 0 } .facts div { min-width:110px }
@@ -552,7 +553,7 @@ def _where_section(explanation: Explanation) -> str:
                                   ("Left, with the effects that were added", findings.after,
                                    explanation.left_depends_on)):
         parts.append(f"<h3>{word}</h3>")
-        if gap is findings.after and gap.present and not findings.findings:
+        if word.startswith("Left") and gap.present and not findings.findings:
             parts.append("<p>All of it: no effect was added.</p>")
             continue
         if not gap.present:
