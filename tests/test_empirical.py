@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -13,6 +16,15 @@ from estimator.problem import Problem
 from estimator.residuals import Kernel, KernelResidual
 from estimator.solvers import solve
 from estimator.unknowns import Unknown, Vector
+from problems.alignment.explain_answer import answer_of, text_of
+from problems.alignment.explain_report import page_of
+from problems.alignment.explanation import explained
+from problems.alignment.simulator import preset, simulate
+from problems.console import jsonable
+
+# Effects that would take a part of it up.
+OTHERS = ("beam-mispointing", "carrier-frequency-offset", "tracker-frame-jump", "doppler-timetag-offset",
+          "doppler-bias", "second-order-doppler", "flexible-appendage", "propellant-slosh", "stellar-aberration")
 
 ARCS, SAMPLES, SIGMA = 8, 200, 0.3  # arcs, samples of each, Hz
 LINE = Unknown("line", Vector(2, ("level", "slope")), "Hz", 10.0)
@@ -152,3 +164,35 @@ def test_a_place_in_one_arc_gets_a_term_there() -> None:
     (term,) = carried(measured, place(0, arcs=("pass-3",)))
     assert term.arcs == ("pass-3",) and term.form == "constant"
     assert abs(term.amplitude - 0.7) < 4 * term.sigma
+
+
+def test_answer_text_and_page_of_an_unknown_campaign_say_it() -> None:
+    """A shift of one beam that grows with a temperature, which no effect of the library does."""
+    campaign, _ = simulate(preset("compact", housekeeping=True, doppler_sessions=12), 13)
+    doppler, series = campaign.doppler, campaign.housekeeping["antenna_temperature"]
+    assert doppler is not None
+    shift = doppler.frequency_shift.copy()
+    shift[:, 1] += 0.6 * (np.interp(doppler.time, series.time, series.values) - 291.0)  # Hz, 0.6 Hz/K
+    explanation = explained(replace(campaign, doppler=replace(doppler, frequency_shift=shift)), without=OTHERS)
+    answer = answer_of(explanation)
+    assert answer["verdict"] == "unknown" and answer["effects"] == []
+    for place_ in (*answer["where"], *answer["left"]):
+        assert {"channel", "arcs", "time_scale_s", "unit", "excess", "depends_on", "sentence"} <= set(place_)
+        assert place_["channel"] == "doppler"
+        (relation,) = place_["depends_on"]
+        assert relation["covariate"] == "antenna_temperature" and relation["components"] == [1]
+        assert relation["slope"] == pytest.approx(0.6, abs=0.08) and relation["slope_unit"] == "Hz/K"
+        assert 0.9 < relation["share"] <= 1.0 and relation["p_value"] < 0.005
+        assert "grows with antenna_temperature" in relation["sentence"]
+        assert "grows with antenna_temperature" in place_["sentence"]
+    terms = answer["empirical"]
+    assert terms[0]["label"] == "EMPIRICAL" and terms[0]["component"] == 1 and terms[0]["form"] == "constant"
+    assert terms[0]["held_out_after"] < 0.8 * terms[0]["held_out_before"]
+    assert terms[0]["held_out_after"] == pytest.approx(terms[0]["floor"], rel=0.15)
+    json.dumps(jsonable(answer), allow_nan=False)
+    assert "antenna_temperature" in answer["next_measurement"]
+    text, page = text_of(explanation), page_of(explanation, "flight.nc")
+    assert "EMPIRICAL: not a name" in text and "grows with antenna_temperature" in text
+    assert "EMPIRICAL: not a name" in page and "<b>antenna_temperature</b>" in page
+    assert page.count("<svg") >= len(terms)
+    assert "default-src 'none'" in page and "<script" not in page

@@ -137,7 +137,8 @@ def _places(gap: Gap, depends_on: Sequence[Dependence]) -> list[dict[str, Any]]:
 def _dependence(d: Dependence) -> dict[str, Any]:
     excess, unit = readable(d.excess, d.unit)
     slope = None if d.slope is None else readable(d.slope, d.unit)[0]
-    per = "" if d.covariate_unit == "1" else f"/({d.covariate_unit})"
+    simple = d.covariate_unit.isalnum()
+    per = "" if d.covariate_unit == "1" else f"/{d.covariate_unit}" if simple else f"/({d.covariate_unit})"
     return {"covariate": d.covariate, "components": list(d.components), "form": d.form, "p_value": d.p_value,
             "share": d.share, "excess": excess, "floor": readable(d.floor, d.unit)[0], "unit": unit, "slope": slope,
             "slope_unit": None if slope is None else unit + per, "alike": list(d.alike), "sentence": d.sentence}
