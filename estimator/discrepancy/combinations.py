@@ -6,8 +6,8 @@ with the residuals, so that thousands of sets are compared in the time of one re
 
 The worth of a set is half the drop of the sum of squares, less what a free parameter explains of pure noise: a fixed
 price for each visible direction, the logarithm of the number of settings of a searched parameter, and a price for each
-name. No guess of a typical size enters, so that two names that fit alike are worth alike; implausible sizes are
-excluded. An effect whose size physics fixes has no free direction: it is taken at that size.
+name. No guess of a typical size enters, so that two names that fit alike are worth alike; a size must stay in its
+plausible range, which is the width of a prior and a limit. An effect whose size physics fixes has no free direction: it is taken at that size.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ PER_DIRECTION = 2.0
 """Price of a free visible direction: exceeded by noise in 5 % of the cases for one, 0.04 % for six."""
 PER_NAME = 4.0
 COLLINEAR = 1e-7  # relative eigenvalue below which directions of a set are one
-MARGIN = 4.0  # sigma beyond the plausible range that a size may have
-CURVED = 0.2  # part of a size that the linear model may be wrong by
+MARGIN = 4.0  # sigma beyond the plausible range that a size may have, a quarter of half the range at most
+CURVED = 0.1  # part of a size that the linear model may be wrong by
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +60,13 @@ class Candidate:
     @property
     def scales(self) -> np.ndarray:
         return np.array([self.effect.parameters[i].scale for i in self.parameters])
+
+
+def _half_range(candidate: Candidate) -> np.ndarray:
+    """Half the plausible range of each column's parameter, in its scale."""
+    parameters = [candidate.effect.parameters[k] for k in candidate.parameters]
+    return np.array([max(p.plausible[1] - p.plausible[0], abs(p.plausible[0]), abs(p.plausible[1])) / 2 / p.scale
+                     for p in parameters])
 
 
 def price(effect: EffectInstance, degrees: int) -> float:
@@ -117,9 +124,12 @@ class LinearLibrary:
             change[np.ix_(c.columns, place)] = c.visible
             self._places.append(place)
             start += c.degrees
-        self._inner = change.T @ gram @ change
+        self._regular = change.T @ gram @ change
         self._product = change.T @ right
         self._across = gram @ change
+        # The plausible range as a prior: a direction that only an impossible size would make visible explains nothing.
+        for c, place in zip(candidates, self._places, strict=True):
+            self._regular[np.ix_(place, place)] += c.visible.T @ (c.visible / _half_range(c)[:, None] ** 2)
 
     def indices(self, name: str) -> list[int]:
         """Candidates of that name."""
@@ -143,7 +153,7 @@ class LinearLibrary:
             product = product - self._across[np.ix_(columns, place)].T @ amounts
         steps, spread = np.zeros(len(place)), np.zeros((len(place), len(place)))
         if len(place):
-            eigenvalues, vectors = np.linalg.eigh(self._inner[np.ix_(place, place)])
+            eigenvalues, vectors = np.linalg.eigh(self._regular[np.ix_(place, place)])
             kept = eigenvalues > COLLINEAR
             along = vectors[:, kept].T @ product
             half += 0.5 * float(np.sum(along**2 / eigenvalues[kept]))
@@ -162,7 +172,7 @@ class LinearLibrary:
             value[c.parameters[ordinary]] = moved[ordinary]
             for k, v, s in zip(c.parameters[ordinary], moved[ordinary], sigma[ordinary], strict=True):
                 low, high = c.effect.parameters[k].plausible
-                room = MARGIN * s + CURVED * abs(v)
+                room = min(MARGIN * s, 0.125 * (high - low)) + CURVED * abs(v)
                 plausible &= low - room <= v <= high + room
             sizes[i] = value
         for i in fixed:

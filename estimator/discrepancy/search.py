@@ -34,9 +34,11 @@ SIGNIFICANT = 0.005  # probability of a name where there is nothing, after the s
 MOST_EFFECTS = 6
 INDISTINGUISHABLE = 4.6  # log odds (100 to 1) below which two names explain the data equally well
 TRIED_SETTINGS = 6  # settings of a searched parameter that take part in sets
+REFINEMENTS = 4  # halvings of the step between settings of a searched parameter
+WORTH_REFINING = 0.1  # probability after the search below which settings between those of the grid are tried
 RIVALS = 5  # names that are refitted in the place of an accepted one
 TURNS = 16  # sets that are refitted before the search stops
-ALIKE = 0.5  # part of an effect's squared signature that a name must copy to be looked at in its place
+ALIKE = 0.5  # part of an effect's squared signature that a name must copy for others to change with it
 REFUSALS = 4  # sets in a row that a joint fit did not bear out before the search stops
 LINEAR = 0.03  # part of a drop that the linear model may be wrong by
 
@@ -151,6 +153,7 @@ class Workflow:
         self._fits: dict[tuple[str, ...], Refit] = {}
         self._rounds: dict[tuple[str, ...], _Round] = {}
         self._searched: list[Signature] | None = None
+        self._trials: dict[str, tuple[Problem, dict[str, np.ndarray], Stack]] = {}
         self._noise: dict[str, float] = {}
         self._degrees: dict[str, int] = {}
 
@@ -226,6 +229,9 @@ class Workflow:
         base = stack(problem.holding(*(n for n in key if n in present)), parts) if key else stacked
         signatures = [signature(base, problem, parts, self.library[n], np.zeros(len(self.library[n].parameters)))
                       for n in linear if n not in key and n in present]
+        if not self._rounds:
+            self._count_looks(base, [*signatures, *(on_rows(s, base) for s in self.searched_signatures())])
+        self._refine(base, stacked, key)
         signatures += [on_rows(s, base) for s in self.searched_signatures()]
         mine = [signature(base, problem, parts, self.library[n], np.asarray(point[n], dtype=float), whole=True)
                 for n in key if n in present]
@@ -241,6 +247,16 @@ class Workflow:
         result = _Round(fit, problem, parts, stacked, table, find_gap(problem, stacked, parts), library, members)
         self._rounds[key] = result
         return result
+
+    def _count_looks(self, base: Stack, signatures: Sequence[Signature]) -> None:
+        """How many independent looks the search of this library amounts to."""
+        self.say("rate of false alarms")
+        widths = np.cumsum([0, *(s.columns.shape[1] for s in signatures)])
+        raw = np.concatenate([s.columns for s in signatures], axis=1)
+        left = base.projected(raw)
+        places = [slice(a, b) for a, b in pairwise(widths)]
+        degrees = [visible_directions(raw[:, p].T @ raw[:, p], left[:, p].T @ left[:, p]).shape[1] for p in places]
+        self.looks = effective_looks([left[:, p] for p in places], degrees)
 
     def _linear_model(self, base: Stack, stacked: Stack, signatures: Sequence[Signature], mine: Sequence[Signature],
                       ) -> tuple[LinearLibrary, tuple[int, ...], list[np.ndarray], list[int]]:
@@ -265,9 +281,6 @@ class Workflow:
             blocks.append(seen)
             strength.append((float(np.sum((seen.T @ right[place]) ** 2)), float(np.sum((seen.T @ now[place]) ** 2))))
             self._degrees[s.effect.name] = max(self._degrees.get(s.effect.name, 0), seen.shape[1])
-        if not self._rounds:
-            self.say("rate of false alarms")
-            self.looks = effective_looks([together[:, p] for p in places], [b.shape[1] for b in blocks])
         chosen: set[int] = set()
         for name in dict.fromkeys(s.effect.name for s in signatures):
             own = [i for i, s in enumerate(signatures) if s.effect.name == name]
@@ -313,10 +326,56 @@ class Workflow:
             touched = problem.with_residuals([r for r in problem.residuals if any(u.name == name for u in r.unknowns)])
             grid = settings(effect)
             stacked = stack(touched.holding(*(u.name for u in touched.unknowns)), touched.linearize(point))
-            found += [signature(stacked, touched, touched.linearize({**point, name: g}, (name,)), effect, g)
-                      for g in grid]
+            self._trials[name] = touched, point, stacked
+            found += [self._trial(name, g) for g in grid]
         self._searched = found
         return found
+
+    def _trial(self, name: str, setting: np.ndarray) -> Signature:
+        """The signature of an effect at one setting of its searched parameters, on the rows that it touches."""
+        touched, point, stacked = self._trials[name]
+        return signature(stacked, touched, touched.linearize({**point, name: setting}, (name,)), self.library[name],
+                         setting)
+
+    def _refine(self, base: Stack, stacked: Stack, skipped: Collection[str]) -> None:
+        """Add settings between those of the grid where the residuals speak for an effect: a lightly damped mode or a
+        jump is seen only close to its frequency or time."""
+        now = stacked.projected(stacked.residual)
+
+        def drop(trial: Signature) -> tuple[float, int]:
+            columns = on_rows(trial, base).columns
+            left = base.projected(columns)
+            seen = visible_directions(columns.T @ columns, left.T @ left)
+            return float(np.sum((seen.T @ (left.T @ now)) ** 2)), seen.shape[1]
+
+        for name in self._trials:
+            own = [s for s in self.searched_signatures() if s.effect.name == name]
+            if name in skipped or not own:
+                continue
+            found = [drop(s) for s in own]
+            best = int(np.argmax([d for d, _ in found]))
+            value, degrees = found[best]
+            if degrees == 0 or after_search(float(chi2.sf(value, degrees)), self.looks) > WORTH_REFINING:
+                continue
+            setting = own[best].setting
+            for index, parameter in enumerate(self.library[name].parameters):
+                if parameter.search is None:
+                    continue
+                low, high, number, kind = parameter.search
+                logarithmic = kind == "logarithmic"
+                span = np.log(high / low) if logarithmic else high - low
+                step = span / max(number - 1, 1) / 2
+                for _ in range(REFINEMENTS):
+                    for sign in (-1, 1):
+                        moved = setting.copy()
+                        moved[index] = moved[index] * np.exp(sign * step) if logarithmic else moved[index] + sign * step
+                        moved[index] = np.clip(moved[index], *parameter.plausible)
+                        trial = self._trial(name, moved)
+                        better, _ = drop(trial)
+                        if better > value:
+                            value, setting = better, moved
+                            self.searched_signatures().append(trial)
+                    step /= 2
 
     def gap(self, effects: Sequence[str]) -> Gap:
         """Where the model with these effects and the data disagree."""
@@ -412,8 +471,9 @@ class Workflow:
         here = self.round(effects)
         library = here.library
         rest = [i for i in here.members if library.candidates[i].name != name]
-        full, without = library.explained(here.members), library.explained(rest)
-        room = 3 * INDISTINGUISHABLE + 0.05 * (full.drop - without.drop)
+        full = library.explained(here.members)
+        loss, _ = self.loss(effects, name)
+        room = 3 * INDISTINGUISHABLE + 0.05 * loss
         mine, size = next((i, s) for i, s in zip(here.members, full.sizes, strict=True)
                           if library.candidates[i].name == name)
         found = []
@@ -421,14 +481,15 @@ class Workflow:
             if other in effects or other in excluded:
                 continue
             i = library.best_setting(rest, other)
-            if i is None or library.copied(mine, size, i) < ALIKE:
+            if i is None:
                 continue
             chosen = [*rest, i]
-            if rest and library.worth(chosen) <= full.worth - INDISTINGUISHABLE:
+            if rest and library.worth(chosen) <= full.worth - INDISTINGUISHABLE and \
+                    library.copied(mine, size, i) > ALIKE:
                 chosen = library.exchanged(chosen, {name, *excluded})
             tried = library.explained(chosen)
             if tried.plausible and tried.worth > full.worth - room and \
-                    self.significant(tried.drop - without.drop, other) < SIGNIFICANT:
+                    self.significant(loss + tried.drop - full.drop, other) < SIGNIFICANT:
                 found.append((tried.worth, other, chosen))
         fits = []
         for _, other, chosen in sorted(found, reverse=True)[:RIVALS]:
@@ -448,15 +509,18 @@ class Workflow:
         return best
 
     def group(self, effects: tuple[str, ...], name: str, excluded: Collection[str] = ()) -> tuple[str, ...]:
-        """Names that explain the data as well as ``name`` beside the other effects, no richer than it."""
+        """Names that explain the data as well as ``name`` beside the other effects.
+
+        A richer name can copy a simpler one: it must come closer in worth to be held for as likely.
+        """
         full = self.fit(effects)
         worth = self.worth(full)
         degrees = self._degrees.get(name, 1)
         without = self.fit([n for n in effects if n != name], full)
         alike = [name]
         for other, refit in self.rivals(effects, name, excluded):
-            if self._degrees.get(other, 1) <= degrees and self.worth(refit) > worth - INDISTINGUISHABLE and \
-                    self.significant(without.cost - refit.cost, other) < SIGNIFICANT:
+            room = INDISTINGUISHABLE / (1 if self._degrees.get(other, 1) <= degrees else 2)
+            if self.worth(refit) > worth - room and self.significant(without.cost - refit.cost, other) < SIGNIFICANT:
                 alike.append(other)
         return tuple(alike)
 
@@ -491,7 +555,7 @@ class Workflow:
             accepted = self.needed(self.best_set(accepted, excluded))
             accepted = self.needed(self.exchanged(accepted, excluded))
             ordered = self.ordered(accepted)
-            unpaid = next((n for k, n in enumerate(ordered) if not self._pays(ordered, k)), None)
+            unpaid = next((n for n in reversed(ordered) if not self._pays(ordered, n)), None)
             if unpaid is not None:
                 self.say(f"{unpaid} does not pay on held-out data")
                 excluded.add(unpaid)
@@ -529,12 +593,11 @@ class Workflow:
             left.remove(best)
         return tuple(here.library.candidates[i].name for i in order)
 
-    def _pays(self, order: tuple[str, ...], place: int) -> bool:
-        """Whether held-out data bear out the effect at ``place``, after those before it."""
-        near = self.fit(order)
-        second, first = (self.fit(order[:k], near).estimate for k in (place + 1, place))
-        return pays(first.problem, first.parts, second.problem, second.parts,
-                    channels_of(second.problem, order[place]))
+    def _pays(self, effects: tuple[str, ...], name: str) -> bool:
+        """Whether held-out data bear out one of the effects beside the others."""
+        near = self.fit(effects)
+        second, first = near.estimate, self.fit([n for n in effects if n != name], near).estimate
+        return pays(first.problem, first.parts, second.problem, second.parts, channels_of(second.problem, name))
 
     def _findings(self, order: tuple[str, ...], excluded: Collection[str]) -> tuple[Finding, ...]:
         findings = []

@@ -1,7 +1,7 @@
 """Kernels as machine code where there is a C compiler, interpreted where there is none: the same numbers either way.
 
 ``compiled`` writes the C source that CasADi generates for a pure function, compiles it once and keeps the library in
-a cache directory under a key made of the source, the compiler and the CasADi version. The cache directory is
+a cache directory under a key made of the source, the compiler, the processor and the CasADi version. The cache directory is
 ``$BORESIGHT_CACHE``, else ``$XDG_CACHE_HOME/boresight``, else ``~/.cache/boresight``; if none of them can be
 written, or ``BORESIGHT_COMPILER=none``, the function is returned as it is.
 """
@@ -21,14 +21,24 @@ import casadi as ca
 import numpy as np
 
 _FLAGS = ("-fPIC", "-shared", "-fno-math-errno")
-_OPTIMIZATION = ((10_000, "-O2"), (40_000, "-O1"))
+_OPTIMIZATION = ((25_000, "-O2"), (40_000, "-O1"))
 """Lines of source up to which a level is used, none above: the compiler's time grows faster than the source (70,000
 lines of straight-line code: 124 s with -O2, 26 s with -O1, 3.5 s with -O0, which runs 1.2 times as long)."""
 
 
 def _flags(source: str) -> tuple[str, ...]:
     lines = source.count("\n")
-    return (next((level for most, level in _OPTIMIZATION if lines <= most), "-O0"), *_FLAGS)
+    level = next((level for most, level in _OPTIMIZATION if lines <= most), "-O0")
+    return (level, *_FLAGS, *(("-march=native",) if _processor() else ()))
+
+
+@functools.cache
+def _processor() -> str:
+    """What this processor can do, where machine code is made for it alone (a cache may be shared between machines)."""
+    information = Path("/proc/cpuinfo")
+    if platform.machine() != "x86_64" or not information.exists():
+        return ""
+    return next((line for line in information.read_text().splitlines() if line.startswith("flags")), "")
 
 
 @functools.cache
@@ -84,7 +94,8 @@ def compiled(function: ca.Function) -> ca.Function:
         source = generator.dump()
         flags = _flags(source)
         key = hashlib.sha256(
-            "\n".join([source, version, *flags, ca.__version__, platform.machine(), function.name()]).encode()
+            "\n".join([source, version, *flags, ca.__version__, platform.machine(), _processor(),
+                       function.name()]).encode()
         ).hexdigest()[:32]
         library = directory / f"{function.name()}-{key}.so"
         if not library.exists():

@@ -63,24 +63,13 @@ class AlignmentSubject:
 
     def problem(self, effects: Sequence[str], candidates: Sequence[str], *, hold_out: bool) -> Problem:
         """See :class:`estimator.discrepancy.subject.Subject`."""
-        moving = [n for n in effects if self._channel(n) in ("torque", "command")]
-        shared: tuple[str, ...] = ()
-        if len(moving) > 1:
-            # One equation of motion with every torque serves all combinations, instead of one compiled for each.
-            shared = tuple(e.name for e in self.library
-                           if e.channel in ("torque", "command") and not (e.state_size and e.channel == "torque"))
-        return alignment_problem(self.training if hold_out else self.everything, effects, candidates=candidates,
-                                 in_equation=shared)
+        return alignment_problem(self.training if hold_out else self.everything, effects, candidates=candidates)
 
     def covariates(self, channel: str, time: np.ndarray) -> Mapping[str, Covariate]:
         """See :func:`problems.alignment.covariates.campaign_covariates`."""
         from problems.alignment.covariates import campaign_covariates
 
         return campaign_covariates(self.everything, channel, time)
-
-    def _channel(self, name: str) -> str:
-        return next(e.channel for e in self.library if name in (e.name, e.family))
-
 
 def explain_campaign(campaign: Campaign, *, hold_out: float = 0.2, without: Sequence[str] = (),
                      effects_places: Sequence[str] = (), say: Say | None = None) -> Findings:

@@ -421,8 +421,8 @@ def _without_short_stretches(campaign: Campaign) -> Campaign:
     return _without_short_stretches(replace(campaign, gnss=shorter))
 
 
-def alignment_problem(model: AlignmentModel, effects: Sequence[str] = (), *, candidates: Sequence[str] = (),
-                      in_equation: Sequence[str] = ()) -> Problem:
+def alignment_problem(model: AlignmentModel, effects: Sequence[str] = (), *,
+                      candidates: Sequence[str] = ()) -> Problem:
     """The joint problem of a prepared campaign.
 
     Args:
@@ -430,15 +430,12 @@ def alignment_problem(model: AlignmentModel, effects: Sequence[str] = (), *, can
         effects: names of effects whose parameters are estimated with everything else.
         candidates: names of effects that are in the kernels and held at zero, for score tests. Torques among them
             act to first order only (:class:`estimator.driven_motion.DrivenSignal`).
-        in_equation: names of torque and command effects that are in the equation of motion and held at zero, so that
-            one compiled equation serves all combinations of them.
 
     Raises:
         RequestError: an unknown effect.
     """
     active = model.effect_instances(effects)
-    dormant = tuple(e for e in model.effect_instances((*candidates, *in_equation)) if e not in active)
-    moving = frozenset(e.name for e in (*active, *model.effect_instances(in_equation)))
+    dormant = tuple(e for e in model.effect_instances(candidates) if e not in active)
     # One order whatever is active, so that kernels are shared and found in the cache.
     everything = tuple(sorted((*active, *dormant), key=lambda e: e.name))
     unknowns: dict[str, Unknown] = {}
@@ -457,6 +454,7 @@ def alignment_problem(model: AlignmentModel, effects: Sequence[str] = (), *, can
     if model.rotation_arcs:
         need(INERTIA, _entries(starting.normalized_inertia))
     doppler = _doppler(model, everything, positions) if has_doppler else None
+    moving = frozenset(e.name for e in active)
     rotations = [_rotation(model, arc, index, everything, moving) for arc, index in model.rotation_arcs]
     for residual, _ in rotations:
         for unknown in residual.unknowns:
@@ -480,7 +478,7 @@ def alignment_problem(model: AlignmentModel, effects: Sequence[str] = (), *, can
         held.add("inertia_trace")  # without a commanded torque nothing has the unit of a torque
     return Problem(
         unknowns=tuple(unknowns.values()), residuals=tuple(ordered), start=start, held=frozenset(held),
-        rebuild=lambda names: alignment_problem(model, names, candidates=candidates, in_equation=in_equation),
+        rebuild=lambda names: alignment_problem(model, names, candidates=candidates),
         effects=tuple(e.name for e in active),
     )
 
