@@ -7,7 +7,8 @@ with the residuals, so that thousands of sets are compared in the time of one re
 The worth of a set is half the drop of the sum of squares, less what a free parameter explains of pure noise: a fixed
 price for each visible direction, the logarithm of the number of settings of a searched parameter, and a price for each
 name. No guess of a typical size enters, so that two names that fit alike are worth alike; a size must stay in its
-plausible range, which is the width of a prior and a limit. An effect whose size physics fixes has no free direction: it is taken at that size.
+plausible range, which is the width of a prior and a limit. An effect whose size physics fixes has no free direction: it
+is taken at that size.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Kernels as machine code where there is a C compiler, interpreted where there is none: the same numbers either way.
 
 ``compiled`` writes the C source that CasADi generates for a pure function, compiles it once and keeps the library in
-a cache directory under a key made of the source, the compiler, the processor and the CasADi version. The cache directory is
-``$BORESIGHT_CACHE``, else ``$XDG_CACHE_HOME/boresight``, else ``~/.cache/boresight``; if none of them can be
-written, or ``BORESIGHT_COMPILER=none``, the function is returned as it is.
+a cache directory under a key made of the source, the compiler, the processor and the CasADi version. The cache
+directory is ``$BORESIGHT_CACHE``, else ``$XDG_CACHE_HOME/boresight``, else ``~/.cache/boresight``; if none of them can
+be written, or ``BORESIGHT_COMPILER=none``, the function is returned as it is.
 """
 
 from __future__ import annotations

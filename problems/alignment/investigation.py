@@ -71,6 +71,7 @@ class AlignmentSubject:
 
         return campaign_covariates(self.everything, channel, time)
 
+
 def explain_campaign(campaign: Campaign, *, hold_out: float = 0.2, without: Sequence[str] = (),
                      effects_places: Sequence[str] = (), say: Say | None = None) -> Findings:
     """Find what the plain model of a campaign misses; see :mod:`estimator.discrepancy.search`."""
