@@ -262,7 +262,7 @@ def campaign_of(case: Case) -> tuple[Any, dict[str, Any]] | None:
                 return None
         told[name] = values.tolist()
         chosen[stranger or name] = values
-    if noise != 1.0 and not 1 / 20 < noise < 60:
+    if noise != 1.0 and not 1 / 20 < noise < 20:
         return None
     if noise != 1.0:
         for key, values in chosen.items():  # keep the others as visible as asked for

@@ -30,7 +30,7 @@ from estimator.residuals import Linearization, Residual
 from estimator.solvers.gauss_newton import Options, solve
 from estimator.solvers.summary import summarized
 
-SIGNIFICANT = 0.005  # probability of a name where there is nothing, after the search
+SIGNIFICANT = 0.008  # probability of a name where there is nothing, after the search
 MOST_EFFECTS = 6
 INDISTINGUISHABLE = 4.6  # log odds (100 to 1) below which two names explain the data equally well
 TRIED_SETTINGS = 6  # settings of a searched parameter that take part in sets
