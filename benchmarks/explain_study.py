@@ -2,7 +2,7 @@
 
     python -m benchmarks.explain_study [--out FILE.jsonl] [--workers 2] [--kinds quiet,one,two,outside] [--seeds 10]
                                        [--sizes 3,5,8,15] [--quiet 300] [--two 100] [--outside 60] [--rivals]
-    python -m benchmarks.explain_study --report [--out FILE.jsonl]
+    python -m benchmarks.explain_study --report [--out FILE.jsonl] [--page docs/explain_study.md]
 
 Every case is one compact campaign (all channels, about an hour) with its own orbit, mounting, inertia, attitudes and
 noise. The size of a hidden effect is stated in sigma: the root of the sum of squares that its signature has on the
@@ -651,6 +651,63 @@ def confusion(entries: Iterable[dict[str, Any]], path: Path, size: float) -> Non
     plt.close(figure)
 
 
+def _percent(value: float | None) -> str:
+    return "" if value is None else f"{100 * value:.1f} %"
+
+
+def page(result: dict[str, Any]) -> str:
+    """The documentation page of the study, every number from ``result``."""
+    lines = [
+        "# How often `boresight explain` is right", "",
+        "Written by `python -m benchmarks.explain_study --report`. Hidden effects of known size in compact campaigns",
+        "(about an hour, all channels) of our own simulator, each with its own orbit, mounting, inertia, attitudes and",
+        "noise. Sizes are in sigma: the root of the sum of squares that the effect's signature has on the samples of",
+        "the fit, calibration unknowns projected out. The cases are drawn in random order from the whole plan, so a",
+        "part of it is a fair sample. *Right*: the true name alone or in its group, and no other name. *Look-alike*:",
+        "what was named explains the same data as well as the truth does (the truth lowers the sum of squares by less",
+        f"than {LOOK_ALIKE:g} beyond it).", "",
+        "| question | campaigns | answer |", "|---|---|---|"]
+
+    def row(question: str, campaigns: object, answer: str) -> None:
+        lines.append(f"| {question} | {campaigns} | {answer} |")
+
+    if quiet := result.get("quiet"):
+        row("nothing hidden: a name is given", quiet["campaigns"], f"{quiet['false_names']} times, "
+            f"{_percent(quiet['rate'])}, upper 95 % bound {_percent(quiet['upper_95'])}")
+        row("nothing hidden: anything but `quiet`", quiet["campaigns"], f"{quiet['not_quiet']} times, upper 95 % bound "
+            f"{_percent(quiet['not_quiet_upper_95'])}")
+    for size, one in result.get("one", {}).items():
+        row(f"one effect of {size}: right", one["campaigns"], f"{_percent(one['right'])}; alone "
+            f"{_percent(one['single_right'])}; median group {one['median_group'] or 0:g}")
+        row(f"one effect of {size}: another name, of these look-alikes", one["campaigns"],
+            f"{_percent(one['wrong_name'])}, {_percent(one['wrong_by_a_look_alike'])}")
+        row(f"one effect of {size}: no name", one["campaigns"], _percent(one["nothing"]))
+    if two := result.get("two"):
+        row("two effects of 12 sigma: both right", two["campaigns"],
+            f"{_percent(two['both_right'])}; a look-alike in the place of one {_percent(two['wrong_by_a_look_alike'])}")
+    if outside := result.get("outside"):
+        told = outside["campaigns"] - outside["copied_by_the_library"]
+        row("15 sigma of what the library does not hold, and does not copy: `unknown`",
+            f"{told} of {outside['campaigns']}",
+            f"{_percent(outside['unknown'])}; a wrong single name {_percent(outside['wrong_single_name'])}")
+    if times := result.get("cpu_seconds"):
+        lines += ["", f"Processor time of a case: median {times['median']:.1f} s, largest {times['largest']:.0f} s."]
+    if rivals := {k: v for k, v in result.get("rivals", {}).items() if v}:
+        lines += ["", "Rivals on the same campaigns:", "", "| rival | measure | value |", "|---|---|---|"]
+        for rival, values in rivals.items():
+            for key, value in values.items():
+                shown = f"{value['count']} of {value['of']}" if isinstance(value, dict) else f"{value:.3g}"
+                lines.append(f"| {rival.replace('_', ' ')} | {key.replace('_', ' ')} | {shown} |")
+    by_effect = {size: one["by_effect"] for size, one in result.get("one", {}).items()}
+    if by_effect:
+        sizes = list(by_effect)
+        lines += ["", "Right by effect:", "", "| effect | " + " | ".join(sizes) + " |", "|---" * (len(sizes) + 1) + "|"]
+        for name in sorted({n for b in by_effect.values() for n in b}):
+            cells = [f"{b[name]['count']} of {b[name]['of']}" if name in b else "" for b in by_effect.values()]
+            lines.append(f"| `{name}` | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
 def report(arguments: argparse.Namespace) -> None:
     """Tables to standard output, numbers and pictures to the results."""
     from estimator.models.files import written_atomically
@@ -662,6 +719,9 @@ def report(arguments: argparse.Namespace) -> None:
     arguments.results.mkdir(parents=True, exist_ok=True)
     with written_atomically(target) as temporary:
         temporary.write_text(json.dumps(result, indent=1) + "\n")
+    if arguments.page:
+        with written_atomically(arguments.page) as temporary:
+            temporary.write_text(page(result))
     for size in sorted({e["size"] for e in entries if e["kind"] == "one"}):
         confusion(entries, arguments.results / f"explain_confusion_{size:g}_sigma.png", size)
     print(json.dumps({k: v for k, v in result.items() if k != "not_visible"}, indent=1))
@@ -692,6 +752,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--minutes", type=float, default=1e6, help="start no campaign after this long")
     parser.add_argument("--rivals", action="store_true")
     parser.add_argument("--report", action="store_true", help="tables and pictures of what is done")
+    parser.add_argument("--page", type=Path, default=None, help="documentation page to write with the report")
     chosen = parser.parse_args(arguments)
     if not chosen.report:
         study(chosen)
