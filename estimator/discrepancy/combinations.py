@@ -21,9 +21,10 @@ import numpy as np
 from estimator.discrepancy.score import INVISIBLE, settings
 from estimator.effects.declaration import EffectInstance
 
-PER_DIRECTION = 2.0
-"""Price of a free visible direction: exceeded by noise in 5 % of the cases for one, 0.04 % for six."""
-PER_NAME = 4.0
+PER_DIRECTION = 1.5
+"""Price of a free visible direction: noise explains more in 8 % of the cases for one, 0.6 % for six. Whether an effect
+is there at all is for its significance after the search to say; the price only weighs names against each other."""
+PER_NAME = 2.0
 COLLINEAR = 1e-7  # relative eigenvalue below which directions of a set are one
 MARGIN = 4.0  # sigma beyond the plausible range that a size may have, a quarter of half the range at most
 CURVED = 0.1  # part of a size that the linear model may be wrong by
