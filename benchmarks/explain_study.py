@@ -172,7 +172,7 @@ def direction(effect: Any, draw: np.random.Generator) -> np.ndarray:
                 a, b = ("xyz".index(c) for c in name[-2:])
                 values[i] = effect.parameters[i].scale * matrix[a, b]
     if "damping_ratio" in names:
-        values[names.index("damping_ratio")] = 0.01
+        values[names.index("damping_ratio")] = effect.parameters[names.index("damping_ratio")].scale
     return values
 
 

@@ -7,12 +7,13 @@ import casadi as ca
 from estimator.effects.declaration import Parameter, Sample, declare
 from estimator.models import flexible_mode
 from estimator.models.rotations import Matrix
+from estimator.models.smooth import positive
 from estimator.models.three_by_three import symmetric
 
 
 def _reaction(sample: Sample, p: Matrix) -> flexible_mode.Reaction:
     return flexible_mode.reaction(sample.inertia, sample.rate, sample.other_torque, sample.state[:3],
-                                  sample.state[3:], symmetric(p), 2 * ca.pi * p[6], p[7])
+                                  sample.state[3:], symmetric(p), 2 * ca.pi * p[6], positive(p[7]))
 
 
 def contribution(sample: Sample, p: Matrix) -> Matrix:
@@ -35,7 +36,7 @@ EFFECT = declare(
     summary="A vibration mode exchanges momentum with the body. A mode of coupling vector d (kg^1/2 m) has the "
             "coupling matrix d d^T; its six entries are the parameters because d itself has no direction at zero, and "
             "the principal vector of the matrix is d. Other state-carrying torques are not in the acceleration "
-            "that drives the mode.",
+            "that drives the mode. The size of the damping ratio counts, not its sign.",
     formula="-K q'' - w x (K q'), q'' + 2 z n q' + n^2 q = -w', K = d d^T",
     zero="coupling = 0",
     reference="Likins, Dynamics and Control of Flexible Space Vehicles, JPL TR 32-1329, 1970 (hybrid coordinates)",

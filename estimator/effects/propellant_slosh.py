@@ -7,12 +7,13 @@ import casadi as ca
 from estimator.effects.declaration import Parameter, Sample, declare
 from estimator.models import propellant
 from estimator.models.rotations import Matrix
+from estimator.models.smooth import positive
 from estimator.models.three_by_three import symmetric
 
 
 def _reaction(sample: Sample, p: Matrix) -> propellant.Reaction:
     return propellant.reaction(sample.inertia, sample.rate, sample.other_torque, ca.reshape(sample.state[:9], 3, 3),
-                               ca.reshape(sample.state[9:], 3, 3), symmetric(p), 2 * ca.pi * p[6], p[7])
+                               ca.reshape(sample.state[9:], 3, 3), symmetric(p), 2 * ca.pi * p[6], positive(p[7]))
 
 
 def contribution(sample: Sample, p: Matrix) -> Matrix:
@@ -35,7 +36,7 @@ EFFECT = declare(
     summary="A mass m at b in the tank moves on three equal springs with damping. Its parameters are the entries of "
             "the second moment m b b^T about the centre of mass (several tanks of one frequency add up). The "
             "centrifugal acceleration drives it as well as the angular one. Other state-carrying torques are not in "
-            "the acceleration that drives the mass.",
+            "the acceleration that drives the mass. The size of the damping ratio counts, not its sign.",
     formula="-m r x a + m b x (w' x b + w x (w x b)), r = b + xi, a the acceleration of the mass",
     zero="moment = 0",
     reference="Dodge, The New Dynamic Behavior of Liquids in Moving Containers, chapter 3 (spring-mass model)",
