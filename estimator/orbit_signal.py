@@ -14,12 +14,22 @@ import numpy as np
 
 from estimator.models.errors import RequestError
 from estimator.models.orbit_forces import orbital_axes
-from estimator.models.orbit_integration import DenseOrbit, Grid, Inputs, Tolerance, propagate, slope
+from estimator.models.orbit_integration import (
+    DenseOrbit,
+    Grid,
+    Inputs,
+    Tolerance,
+    moved_grid,
+    propagate,
+    slope,
+)
 from estimator.models.orbit_motion import Motion
 from estimator.signals import Values
 from estimator.unknowns import Unknown, Vector
 
 _SAME_GRID = 1e-3  # relative change of the state at a segment's start up to which its grid is kept
+_EDGE = 3600.0  # s that the two ends of a segment may have moved together for its steps to be tried again
+_GRIDS = 256  # segments of which the steps are kept
 
 
 _SHORTEST = 1.0  # s that a burn of finite length takes at the least
@@ -72,6 +82,11 @@ def before_step(after: np.ndarray, velocity: np.ndarray) -> np.ndarray:
     for _ in range(8):
         x[3:] += after[3:] - np.asarray(_AFTER(x, velocity)).ravel()[3:]
     return x
+
+
+def _near(x: np.ndarray, other: np.ndarray) -> bool:
+    return bool(np.linalg.norm(x[:3] - other[:3]) < _SAME_GRID * np.linalg.norm(x[:3])
+                and np.linalg.norm(x[3:] - other[3:]) < _SAME_GRID * np.linalg.norm(x[3:]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,12 +185,13 @@ class OrbitArc:
                 burning.append(s)
         switches.sort(key=lambda item: item[0] * direction)
         segments, t, width = [], self.start, 60.0
+        known = dict(self._grids)
         for place, switch, side in [*switches, (end, None, 0)]:
             on = tuple((step_columns[s.unknown.name], s.velocity(values), s.duration(values)) for s in burning)
             if self.thrust:
                 parameters = parameters.copy()
                 parameters[self.motion.slices[self.thrust]] = sum((v / d for _, v, d in on), np.zeros(3))
-            grid = self._grid(t, place, x)
+            grid = self._grid(t, place, x, known)
             orbit, found = propagate(self.motion.step, self.motion.step.start(x), parameters, self.inputs,
                                      np.array([t, place]), grid=grid, tolerance=self.tolerance,
                                      first_step=width)
@@ -183,6 +199,7 @@ class OrbitArc:
             if len(orbit.times) > 2:
                 width = max(60.0, float(np.max(np.abs(np.diff(orbit.times[-3:])))))
             if grid is None:
+                # Steps that were moved are not kept, so that none is ever far from those of the error control.
                 self._keep(t, place, x, found)
             segments.append(_Segment(orbit, chain, min(t, place), max(t, place), on))
             x, carried = orbit.values[-1][:6], orbit.values[-1][6:].reshape(-1, 6).T
@@ -234,17 +251,22 @@ class OrbitArc:
             result[..., column + 4] -= thrust @ (velocity / duration**2)
         return result
 
-    def _grid(self, a: float, b: float, x: np.ndarray) -> Grid | None:
-        kept = self._grids.get((a, b))
-        if kept is None:
-            return None
-        made_for, grid = kept
-        near = (np.linalg.norm(x[:3] - made_for[:3]) < _SAME_GRID * np.linalg.norm(x[:3])
-                and np.linalg.norm(x[3:] - made_for[3:]) < _SAME_GRID * np.linalg.norm(x[3:]))
-        return grid if near else None
+    def _grid(self, a: float, b: float, x: np.ndarray, known: dict) -> Grid | None:
+        """Steps that were found between the same times, or times near them, from a state near ``x`` (6,)."""
+        kept = known.get((a, b))
+        if kept is not None:
+            return kept[1] if _near(x, kept[0]) else None
+        close = [key for key in known if abs(key[0] - a) + abs(key[1] - b) < _EDGE and (key[1] - key[0]) * (b - a) > 0]
+        for key in sorted(close, key=lambda key: abs(key[0] - a) + abs(key[1] - b))[:2]:
+            made_for, grid = known[key]
+            if _near(x, made_for):
+                moved = moved_grid(grid, key, (a, b), self.inputs)
+                if moved is not None:
+                    return moved
+        return None
 
     def _keep(self, a: float, b: float, x: np.ndarray, grid: Grid) -> None:
-        if len(self._grids) > 64:
+        if len(self._grids) > _GRIDS:
             self._grids.clear()
         self._grids[a, b] = (np.array(x), grid)
 

@@ -157,6 +157,9 @@ class DenseOrbit:
         return stacked[:, : self.state], shaped
 
 
+_MOVED = 0.2  # of a step by which its ends may move before steps are sought again
+
+
 @dataclass(frozen=True)
 class Tolerance:
     """Error allowed per step of the state: ``absolute + relative |x|``, one pair for positions and one for
@@ -287,6 +290,36 @@ class Grid:
     """Steps and inputs at their stages, per interval between breaks."""
 
     segments: tuple[tuple[np.ndarray, np.ndarray], ...]
+
+
+def moved_grid(grid: Grid, before: tuple[float, float], after: tuple[float, float], inputs: Inputs) -> Grid | None:
+    """The steps between two times for two others near them, so that they need not be found again.
+
+    Args:
+        grid: of one interval; before: its ends, s.
+        after: the ends that are asked for, s.
+        inputs: outside inputs, asked once for all stages.
+
+    Returns:
+        None where an end has moved by more than a fifth of a step beside it: the error of the steps would no longer be
+        the controlled one.
+    """
+    steps, _ = grid.segments[0]
+    if len(steps) < 2 or (after[1] - after[0]) * (before[1] - before[0]) <= 0:
+        return None
+    ratio = (after[1] - after[0]) / (before[1] - before[0])
+    ends = before[0] + np.concatenate([[0.0], np.cumsum(steps)])
+    shift = np.abs(after[0] + ratio * (ends - before[0]) - ends)
+    # The last step is what was left of the interval: shorter than its error asks for.
+    local = np.abs(steps[:-1])
+    far = np.any(np.maximum(shift[:-2], shift[1:-1]) > _MOVED * local) or shift[-1] > _MOVED * local[-1]
+    if far or ratio > 1 + _MOVED:
+        return None
+    widths = steps * ratio
+    begins = after[0] + np.concatenate([[0.0], np.cumsum(widths)[:-1]])
+    stages = (begins[:, None] + widths[:, None] * STAGE_TIMES).ravel()
+    table = _inside(inputs, *after)(stages).reshape(len(widths), len(STAGE_TIMES), -1)
+    return Grid(((widths, np.ascontiguousarray(table.transpose(0, 2, 1))),))
 
 
 def _inside(inputs: Inputs, a: float, b: float) -> Inputs:
