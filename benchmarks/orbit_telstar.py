@@ -1,13 +1,16 @@
 """What separates the ranges of a kept geostationary satellite from the model of its orbit, measured on Telstar 11N.
 
 Run ``python -m benchmarks.orbit_telstar FOLDER [--write]`` with the folder that holds the ranges (``*.gmd``) and the
-two-line elements (``tle-*.txt``). It prints the table of effects and the comparison with the two-line elements, which
-no fit uses but to start; ``--write`` puts them into the results, the page ``docs/orbit.md`` and the figure.
+two-line elements (``tle-*.txt``). It prints the tables of effects and the comparison with the two-line elements, which
+no fit uses but to start; ``--write`` puts them into the results, the page ``docs/orbit.md`` and the figure. The longest
+arc is then fitted once more with the scale of the ranges held where its longitude is that of the elements: what that
+changes elsewhere is what the ambiguity of scale, common bias and longitude costs.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -22,13 +25,15 @@ from estimator.residuals import KernelResidual
 from problems.geo_orbit.explanation import explained
 from problems.geo_orbit.initial_orbit import state_of_elements
 from problems.geo_orbit.kept_orbit import KeptExplanation
-from problems.geo_orbit.manoeuvres import FAMILY
+from problems.geo_orbit.manoeuvres import FAMILY, Fit, Prior, gauss_newton
 from problems.readers.tracking_files import read_files
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "orbit.md"
 FIGURE = ROOT / "docs" / "figures" / "telstar-residuals.png"
 PICTURE = "![Residuals of Telstar 11N without and with manoeuvres](figures/telstar-residuals.png)"
+SCALE = "range-scale-error"
+LARGEST = 12  # manoeuvres in the table
 MARKS = ("<!-- telstar table -->", "<!-- end of telstar table -->")
 
 
@@ -38,20 +43,25 @@ def element_sets(path: Path) -> list[tuple[np.datetime64, tuple[str, str]]]:
     lines = path.read_text().splitlines()
     for one, two in pairwise(lines):
         if one.startswith("1 ") and two.startswith("2 "):
-            start = np.datetime64(f"20{one[18:20]}-01-01T00:00:00", "us")
+            start: np.datetime64 = np.datetime64(f"20{one[18:20]}-01-01T00:00:00", "us")
             found.append((start + np.timedelta64(round((float(one[20:32]) - 1) * 86400e6), "us"), (one, two)))
     return found
 
 
 def against_elements(answer: KeptExplanation, path: Path) -> dict[str, float]:
-    """Differences of the fitted orbit from the two-line elements at their epochs: medians, deg and m."""
+    """Differences of the fitted orbits of all arcs from the two-line elements: see :func:`differences`."""
+    return differences(answer, [p.fit for p in answer.arcs], path)
+
+
+def differences(answer: KeptExplanation, fits: Sequence[Fit], path: Path) -> dict[str, float]:
+    """Differences of fitted orbits from the two-line elements at their epochs: medians, deg and m."""
     model = answer.model
     rows = []
     for utc, lines in element_sets(path):
         tai = tai_from_utc([str(utc)])[0]
         seconds = float(model.seconds(np.array([tai]))[0])
-        for piece in answer.arcs:
-            residual = piece.fit.problem.residuals[0]
+        for fit in fits:
+            residual = fit.problem.residuals[0]
             assert isinstance(residual, KernelResidual)
             signal = residual.signals[0]
             assert isinstance(signal, OrbitSignal)
@@ -60,7 +70,7 @@ def against_elements(answer: KeptExplanation, path: Path) -> dict[str, float]:
         else:
             continue
         theirs = np.concatenate(state_of_elements(lines, tai))
-        ours = signal.arc.at(np.array([seconds]), piece.fit.values)[0][0]
+        ours = signal.arc.at(np.array([seconds]), fit.values)[0][0]
         places = model.environment.earth_fixed_state(np.full(2, seconds), np.vstack([ours, theirs]))
         longitude = np.degrees(np.arctan2(places[:, 1], places[:, 0]))
         poles = [np.cross(x[:3], x[3:]) / np.linalg.norm(np.cross(x[:3], x[3:])) for x in (ours, theirs)]
@@ -78,6 +88,70 @@ def against_elements(answer: KeptExplanation, path: Path) -> dict[str, float]:
     }
 
 
+def with_scale(answer: KeptExplanation, fit: Fit, value: float) -> Fit:
+    """The fit of an arc once more with the scale of the ranges held."""
+    # To begin with, state and calibration follow the scale and the manoeuvres stay: a linear step of a burn of which
+    # the data know little leads nowhere.
+    rest = [k for u in fit.unknowns if not u.name.startswith(FAMILY) and u.name != SCALE
+            for k in range(fit.columns(u.name).start, fit.columns(u.name).stop)]
+    at = fit.columns(SCALE).start
+    rows = np.vstack([fit.jacobian, fit.prior])
+    step = np.zeros(len(fit.scales))
+    step[at] = (value - float(fit.values[SCALE][0])) / fit.scales[at]
+    step[rest] = -np.linalg.lstsq(rows[:, rest], rows[:, at] * step[at], rcond=None)[0]
+    step *= fit.scales
+    start = {**fit.values, **{u.name: fit.values[u.name] + step[fit.columns(u.name)] for u in fit.unknowns}}
+    root = fit.prior / fit.scales
+    flat = np.concatenate([np.atleast_1d(fit.values[u.name]) for u in fit.unknowns])
+    mean = flat - np.linalg.lstsq(root, fit.off, rcond=None)[0]
+    before = Prior(tuple(u.name for u in fit.unknowns), mean, root)
+    held = Prior.of(SCALE, np.array([value]), np.array([1e-10]))
+    return gauss_newton(fit.problem, start, [before, held], answer.found.noise, iterations=15, enough=1e-5)
+
+
+def held_to_elements(answer: KeptExplanation, path: Path) -> dict[str, float]:
+    """What changes in the longest arc where the scale makes its longitude that of the two-line elements."""
+    fit = max((p.fit for p in answer.arcs), key=lambda f: f.rows)
+    if all(u.name != SCALE for u in fit.unknowns):
+        return {}
+    free = float(fit.values[SCALE][0])
+    now = differences(answer, [fit], path)["longitude_difference_deg"]
+    # In small steps: the orbit turns by tenths of a degree, beyond what one linear step can predict.
+    value, held, there, slope = free, fit, now, 1e3
+    for _ in range(12):
+        step = float(np.clip(-there / slope, -4e-5, 4e-5))
+        moved_to = with_scale(answer, held, value + step)
+        new = differences(answer, [moved_to], path)["longitude_difference_deg"]
+        slope = (new - there) / step
+        value, held, there = value + step, moved_to, new
+        if abs(there) < 2e-3:
+            break
+    sigma = np.sqrt(np.diag(fit.covariance()) * max(1.0, fit.square / fit.degrees) * answer.found.shared)
+    moved, steps = [0.0], [0.0]
+    for u in fit.unknowns:
+        if u.name.startswith(FAMILY):
+            change = np.abs(held.values[u.name][1:4] - fit.values[u.name][1:4])
+            moved.append(float(np.max(change / sigma[fit.columns(u.name)][1:4])))
+            steps.append(float(np.median(change)))
+    return {
+        "scale_free": free,
+        "scale_held": value,
+        "longitude_difference_deg": there,
+        "rms_over_noise_free": float(np.sqrt(fit.square / fit.rows)),
+        "rms_over_noise_held": float(np.sqrt(held.square / held.rows)),
+        "manoeuvres_moved_most_sigmas": max(moved),
+        "manoeuvres_moved_median_m_s": float(np.median(steps)),
+    }
+
+
+def kind(e: dict[str, Any]) -> str:
+    """What a manoeuvre does, by its largest effect on the orbit."""
+    p = e["parameters"]
+    if abs(p["along"]["value"]) >= abs(p["cross"]["value"]):
+        return "east-west"
+    return "north" if p["cross"]["value"] > 0 else "south"
+
+
 def measured(folder: Path) -> tuple[KeptExplanation, dict[str, Any]]:
     """The answer and everything of it that is written."""
     ranges, elements = sorted(folder.glob("*.gmd")), sorted(folder.glob("tle-*.txt"))
@@ -88,48 +162,93 @@ def measured(folder: Path) -> tuple[KeptExplanation, dict[str, Any]]:
     result = answer.as_dict()
     result["before"] = {c: {"rms": a, "held_out_rms": b, "unit": u} for c, (a, b, u) in answer.before.items()}
     result["two_line_elements"] = against_elements(answer, elements[0])
+    result["scale_held_to_elements"] = held_to_elements(answer, elements[0])
     return answer, result
 
 
+def _held(e: dict[str, Any]) -> str:
+    return "; ".join(f"{h['before']:.4g} -> {h['after']:.4g}" for h in e["held_out"].values())
+
+
+def _size(p: dict[str, Any], factor: float = 1.0) -> str:
+    digits = max(0, min(6, 1 - int(np.floor(np.log10(max(factor * p["sigma"], 1e-9))))))
+    return f"{factor * p['value']:.{digits}f} +- {factor * p['sigma']:.{digits}f}"
+
+
 def table(result: dict[str, Any]) -> str:
-    """The findings as Markdown: calibration one by one, manoeuvres in the order of time."""
+    """The findings as Markdown: calibration one by one, manoeuvres by kind and the largest of them."""
     left, before = result["left"][0], next(iter(result["before"].values()))
-    tle = result["two_line_elements"]
-    moves = sorted((e for e in result["effects"] if e["name"].startswith(FAMILY)), key=lambda e: e["time_utc"])
+    tle, held = result["two_line_elements"], result["scale_held_to_elements"]
+    moves = [e for e in result["effects"] if e["name"].startswith(FAMILY)]
     lines = [
         f"One orbit without manoeuvres misses the ranges by {before['rms']:.4g} m RMS; with everything found "
         f"{left['rms']:.3g} m are left, {left['held_out_rms']:.3g} m in the passes that no fit has seen. "
-        f"{len(moves)} manoeuvres; verdict: {result['verdict']}; {result['seconds']:.0f} s.",
+        f"{len(moves)} manoeuvres in {len(result['arcs'])} successive arcs; {result['seconds']:.0f} s. "
+        f"Verdict: {result['verdict']}: {result['why']}.",
         "",
-        "| effect | size | held out, m, without -> with |",
-        "|---|---|---|",
+        "| arc, UTC | ranges | manoeuvres | left, m RMS | held out, m RMS |",
+        "|---|--:|--:|--:|--:|",
     ]
+    for a in sorted(result["arcs"], key=lambda a: a["from"]):
+        rest = next(iter(a["left"].values()))
+        lines.append(f"| {a['from'][:16]} to {a['to'][:16]} | {a['measurements']} | {a['manoeuvres']} "
+                     f"| {rest['rms']:.3g} | {rest['held_out_rms']:.3g} |")
+    lines += ["", "| effect | size | held out, m, without -> with |", "|---|---|---|"]
     for e in result["effects"]:
         if not e["name"].startswith(FAMILY):
             size = ", ".join(
                 f"{n} {p['value']:.5g} +- {p['sigma']:.1g} {p['unit']}" for n, p in e["parameters"].items()
             )
-            held = "; ".join(f"{h['before']:.4g} -> {h['after']:.3g}" for h in e["held_out"].values())
-            name = " or ".join(e["group"])
-            lines.append(f"| {name} | {size} | {held} |")
-    lines += ["", "| manoeuvre (UTC) | s | radial, along, cross, mm/s | burn, min | held out, m, without |",
-              "|---|---|---|---|---|"]
-    for e in moves:
+            lines.append(f"| {' or '.join(e['group'])} | {size} | {_held(e)} |")
+    lines += ["", "| manoeuvres | count | mm/s, median (least to largest) | in all, m/s | burn, min, median |",
+              "|---|--:|--:|--:|--:|"]
+    for k in ("north", "south", "east-west"):
+        own = [e for e in moves if kind(e) == k]
+        if not own:
+            continue
+        total = np.array([np.sqrt(sum(e["parameters"][n]["value"] ** 2 for n in ("radial", "along", "cross")))
+                          for e in own])
+        burns = [e["parameters"]["duration"] for e in own if "duration" in e["parameters"]]
+        sure = [b["value"] / 60 for b in burns if b["value"] > 5 * b["sigma"]]
+        length = f"{np.median(sure):.0f} over {len(sure)}" if sure else "-"
+        lines.append(f"| {k} | {len(own)} | {1e3 * np.median(total):.1f} ({1e3 * total.min():.1f} to "
+                     f"{1e3 * total.max():.1f}) | {total.sum():.2f} | {length} |")
+    lines += ["", f"The {min(LARGEST, len(moves))} with the largest scores; all are in "
+              "`benchmarks/results/orbit_telstar.json`.", "",
+              "| manoeuvre (UTC) | +- s | radial, along, cross, mm/s | burn, min | held out, m, without -> with |",
+              "|---|--:|---|--:|---|"]
+    for e in sorted(moves, key=lambda e: -e["score"])[:LARGEST]:
         p = e["parameters"]
-        size = ", ".join(
-            f"{1e3 * p[k]['value']:.2f} +- {1e3 * p[k]['sigma']:.2f}" for k in ("radial", "along", "cross")
-        )
+        size = ", ".join(_size(p[k], 1e3) for k in ("radial", "along", "cross"))
         burn = f"{p['duration']['value'] / 60:.0f}" if "duration" in p else "-"
-        held = "; ".join(f"{h['before']:.4g}" for h in e["held_out"].values())
-        lines.append(f"| {e['time_utc'][:19]} | {p['time']['sigma']:.0f} | {size} | {burn} | {held} |")
+        lines.append(f"| {e['time_utc'][:19]} | {p['time']['sigma']:.0f} | {size} | {burn} | {_held(e)} |")
     lines += [
         "",
         f"Against {tle['element_sets']} two-line element sets: longitude {tle['longitude_deg']:.3f} degrees, "
         f"{tle['longitude_difference_deg']:+.4f} degrees from theirs (scatter {tle['longitude_scatter_deg']:.4f}); "
         f"planes {tle['orbit_planes_apart_deg']:.4f} degrees apart; radius {tle['radius_difference_m']:+.0f} m.",
     ]
+    if held:
+        lines += [
+            "",
+            "The difference of longitude is what ranges from Europe alone leave open: a turn of the orbit about the "
+            "Earth's axis, a common bias and the scale change all ranges nearly alike. With the scale held where the "
+            f"longest arc has the elements' longitude, {held['scale_held']:.3e} in place of {held['scale_free']:.3e}, "
+            f"the longitudes are {held['longitude_difference_deg']:+.4f} degrees apart, the ranges fit to "
+            f"{held['rms_over_noise_held']:.3f} times the noise of quiet data in place of "
+            f"{held['rms_over_noise_free']:.3f}, and the manoeuvres' velocities move by "
+            f"{1e3 * held['manoeuvres_moved_median_m_s']:.2g} mm/s in the median, "
+            f"{held['manoeuvres_moved_most_sigmas']:.2g} sigmas at the most.",
+        ]
+    if result["left_where"]:
+        lines += ["", "Where most is left: " + "; ".join(w["sentence"] for w in result["left_where"]) + "."]
+    if result["rejected"]:
+        lines += ["", "Not believed: " + "; ".join(result["rejected"]) + "."]
     if result["undetermined"]:
         lines += ["", "Not determined by these data: " + "; ".join(result["undetermined"]) + "."]
+    open_ = [f"{e['time_utc'][:16]}: {e['undetermined']}" for e in moves if "undetermined" in e]
+    if open_:
+        lines += ["", "Manoeuvres of which a direction is open: " + "; ".join(open_) + "."]
     return "\n".join(lines)
 
 
@@ -140,28 +259,51 @@ def draw(answer: KeptExplanation) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, (top, bottom) = plt.subplots(2, 1, figsize=(9, 6), sharex=True, constrained_layout=True)
-    fits = [(top, p.plain, "without manoeuvres") for p in answer.arcs]
-    fits += [(bottom, p.fit, "with the manoeuvres and the calibration") for p in answer.arcs]
-    for axis, fit, title in fits:
-        axis.set_prop_cycle(None)
-        for residual, part in zip(fit.problem.residuals, fit.parts, strict=True):
-            assert isinstance(residual, KernelResidual)
-            day = residual.time / 86400.0
-            scale = 1e-3 if axis is top else 1.0
-            label = f"station {residual.name.split('/')[0]}" if fit is answer.arcs[0].fit else None
-            axis.plot(day, scale * part.residual[:, 0], ".", ms=1.5, label=label)
-        axis.set_title(title, fontsize=10)
-    size = float(np.percentile(np.abs(np.concatenate([q.residual[q.weight > 0, 0]
-                                                      for p in answer.arcs for q in p.fit.parts])), 99.5))
-    bottom.set_ylim(-3 * size, 3 * size)
-    for m in (m for p in answer.arcs for m in p.found.manoeuvres):
-        north = abs(m.velocity[2]) > abs(m.velocity[1])
-        bottom.axvline(m.time / 86400.0, color="0.8" if north else "tab:red", lw=0.6, zorder=0)
+    figure, (top, middle, bottom) = plt.subplots(
+        3, 1, figsize=(9, 7.5), sharex=True, constrained_layout=True, height_ratios=(3, 3, 1.6)
+    )
+    day = 86400.0
+    sizes = []
+    for piece in answer.arcs:
+        for axis, fit in ((top, piece.plain), (middle, piece.fit)):
+            axis.set_prop_cycle(None)
+            for residual, part in zip(fit.problem.residuals, fit.parts, strict=True):
+                assert isinstance(residual, KernelResidual)
+                value = part.residual[:, 0] * (1e-3 if axis is top else 1.0)
+                station = residual.name.split("/")[0]
+                label = f"station {station}" if piece is answer.arcs[0] and axis is top else None
+                axis.plot(residual.time / day, value, ".", ms=2.0, label=label)
+                if axis is middle:
+                    sizes.append(np.abs(value))
+        for axis in (top, middle, bottom):
+            for end in (piece.found.low, piece.found.high):
+                axis.axvline(end / day, color="0.6", lw=0.8, ls=":", zorder=0)
+    limit = 1.5 * max(float(np.percentile(np.concatenate(sizes), 98)), 1.0)
+    beyond = int(np.sum(np.concatenate(sizes) > limit))
+    middle.set_ylim(-limit, limit)
+    middle.axhline(0.0, color="0.5", lw=0.6)
+    top.set_title("one orbit in each arc, without manoeuvres", fontsize=10)
+    middle.set_title("with the manoeuvres and the calibration"
+                     + (f" ({beyond} of {sum(map(len, sizes))} ranges are beyond the axis)" if beyond else ""),
+                     fontsize=10)
+    for color, along, text in (("tab:blue", False, "across the orbit's plane"), ("tab:red", True, "along the orbit")):
+        own = [m for p in answer.arcs for m in p.found.manoeuvres
+               if (abs(m.velocity[1]) >= abs(m.velocity[2])) == along]
+        step = [1e3 * m.velocity[1 if along else 2] for m in own]
+        when = [m.time / day for m in own]
+        bottom.vlines(when, 0.0, step, color=color, lw=1.0)
+        bottom.plot(when, step, "." if not along else "s", color=color, ms=4, label=text)
+    bottom.axhline(0.0, color="0.5", lw=0.6)
+    bottom.set_yscale("symlog", linthresh=10.0)
+    bottom.set_yticks([-100.0, -10.0, 0.0, 10.0, 100.0])
+    bottom.set_title("manoeuvres", fontsize=10)
+    bottom.set_ylabel("mm/s")
+    bottom.set_ylim(-1e3, 1e4)
+    bottom.legend(fontsize=8, ncol=2, loc="upper center")
     top.set_ylabel("measured - predicted, km")
-    bottom.set_ylabel("measured - predicted, m")
-    bottom.set_xlabel("days after the first range; lines: burns, red where mostly along the orbit")
-    bottom.legend(fontsize=6, ncol=7, loc="lower left", markerscale=4)
+    middle.set_ylabel("measured - predicted, m")
+    bottom.set_xlabel("days after the first range; dotted: ends of the arcs")
+    figure.legend(*top.get_legend_handles_labels(), fontsize=8, ncol=7, loc="outside upper center", markerscale=4)
     figure.savefig(FIGURE, dpi=130)
     plt.close(figure)
 

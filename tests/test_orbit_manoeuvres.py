@@ -11,11 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from estimator.models.orbit_gravity import gravity_field
+from estimator.models.orbit_integration import Tolerance, moved_grid, propagate
 from estimator.models.orbit_motion import OBLIQUE_PRESSURE, SUN, THRUST, motion, motion_inputs
 from estimator.orbit_signal import OrbitArc, VelocityStep, position_unknown, velocity_unknown
 from estimator.residuals import KernelResidual
 from estimator.unknowns import Unknown, Vector
-from problems.geo_orbit.kept_orbit import KeptExplanation, explained_kept
+from problems.geo_orbit.kept_orbit import KeptExplanation, consistent, explained_kept
+from problems.geo_orbit.manoeuvres import Manoeuvre, neighbours
 from problems.geo_orbit.problem import OrbitModel, orbit_model, orbit_problem
 from problems.geo_orbit.settings import settings_from
 from problems.geo_orbit.tracking import Observations, Station, Tracking
@@ -115,6 +117,14 @@ def check(explanation: KeptExplanation | None, burns: tuple[Burned, ...]) -> Non
         assert after < before
         assert e.proof.p_value < 1e-3
     assert explanation.after["range"][1] < 1.3 * NOISE
+    answer = explanation.as_dict()
+    assert answer["verdict"] in ("named", "ambiguous")
+    for key in ("where", "effects", "next_measurement", "seconds"):
+        assert key in answer
+    for e in answer["effects"]:
+        assert {"name", "group", "parameters", "score", "p_value_after_search", "gap_before", "gap_after",
+                "held_out_before", "held_out_after"} <= set(e)
+        assert all(set(p) == {"value", "sigma", "unit"} for p in e["parameters"].values())
 
 
 def test_derivatives_of_a_burn_follow_from_its_edges() -> None:
@@ -158,3 +168,44 @@ def test_one_manoeuvre_in_a_gap_of_the_data() -> None:
     burns = (Burned(4.05 * DAY, 1200.0, (0.01, 0.05, -0.3)),)
     model = simulated(burns, 8.0, gap=(3.8 * DAY, 4.4 * DAY), seed=3)
     check(explained_kept(model), burns)
+
+
+def test_steps_that_moved_a_little_integrate_alike() -> None:
+    """Steps carried over to neighbouring ends give the same orbit; ends far away get none."""
+    model = simulated((), 3.0)
+    equations = motion(gravity_field("EGM2008_120", 2), [SUN, THRUST], [], 0.02)
+    inputs = motion_inputs(model.environment)
+    start = equations.step.start(np.concatenate([model.position, model.velocity]))
+    parameters = np.array([0.0, 0.0, 0.0])
+    tolerance = Tolerance(1e-12, (1e-3, 1e-3, 1e-3, 1e-7, 1e-7, 1e-7))
+    ends = (0.0, 6e4)
+    _, grid = propagate(equations.step, start, parameters, inputs, np.array(ends), tolerance=tolerance)
+    near = (0.0, 6e4 + 300.0)
+    moved = moved_grid(grid, ends, near, inputs)
+    assert moved is not None
+    again, _ = propagate(equations.step, start, parameters, inputs, np.array(near), grid=moved)
+    exact, _ = propagate(equations.step, start, parameters, inputs, np.array(near))
+    assert np.linalg.norm(again.values[-1][:3] - exact.values[-1][:3]) < 0.02  # m
+    assert moved_grid(grid, ends, (0.0, 9e4), inputs) is None
+    assert moved_grid(grid, ends, (6e4, 0.0), inputs) is None
+
+
+def test_burns_without_a_measurement_between_them_are_neighbours() -> None:
+    steps = {n: Manoeuvre(t, np.zeros(3)) for n, t in (("a", 100.0), ("b", 300.0), ("c", 2000.0), ("d", 5000.0))}
+    times = np.array([0.0, 1000.0, 3000.0, 4000.0, 6000.0])
+    sure = dict.fromkeys(steps, 1.0)
+    assert neighbours(steps, sure, times) == [("a", "b")]
+    assert neighbours(steps, {**sure, "c": 1600.0}, times) == [("a", "b"), ("b", "c"), ("c", "d")]
+
+
+def test_a_name_is_believed_where_successive_arcs_agree() -> None:
+    def offer(value: float, sigma: float) -> tuple[np.ndarray, np.ndarray]:
+        return np.array([value]), np.array([sigma])
+
+    arcs = [(0.0, 1.0), (1.0, 2.0)]
+    assert consistent([{"x": offer(1.0, 0.1)}, {"x": offer(1.1, 0.1)}], arcs) == (("x",), ())
+    believed, rejected = consistent([{"x": offer(1.0, 0.1)}, {"x": offer(-1.0, 0.1)}], arcs)
+    assert not believed and "another size" in rejected[0]
+    believed, rejected = consistent([{"x": offer(1.0, 0.1)}, {}], arcs)
+    assert not believed and "one arc of 2 alone" in rejected[0]
+    assert consistent([{"x": offer(1.0, 0.1)}], arcs[:1]) == (("x",), ())

@@ -26,10 +26,12 @@ from problems.geo_orbit.manoeuvres import (
     LEVEL,
     Fit,
     Found,
+    Manoeuvre,
     Prior,
     Search,
     common_error,
     gauss_newton,
+    neighbours,
 )
 from problems.geo_orbit.problem import OrbitModel, orbit_model, orbit_problem
 from problems.geo_orbit.settings import OrbitSettings
@@ -43,6 +45,13 @@ _OFTEN = 6.0  # instants of measurement in a revolution that it asks for
 _BLOCKS = 8  # held-out passes are so many to a revolution
 _MOST_ARCS = 10
 _MOST = 6  # effects beside calibration and manoeuvres
+_NAMED = 1.3  # what is left over the noise of quiet data up to which nothing is left
+_METRE = {"range": 1.0}  # m; nor below this
+_SPREAD = 0.3  # sigma over size of a velocity step beyond which a direction of it is open
+_SURE = 3.0  # sigmas
+_NEEDED = 1.1  # growth of the sum of squares that tells that what was dropped was needed
+_FITS = 64.0  # mean square over that of quiet data up to which a stretch counts as fitted
+_WORST = 5  # places of what is left that are named
 _UNDETERMINED = 0.5  # posterior over prior sigma beyond which the data say nothing of a number
 
 
@@ -67,7 +76,7 @@ def calibration(model: OrbitModel, without: Sequence[str] = ()) -> tuple[OrbitEf
     return tuple(offered[n] for n in dict.fromkeys(names) if n in offered)
 
 
-_WIDTHS = {"range-bias": 1e4, "range-scale-error": 1e-3, "angle-bias": 0.01, "range-rate-bias": 1.0}  # m, 1, rad, m/s
+_WIDTHS = {"range-bias": 1e4, "range-scale-error": 2e-3, "angle-bias": 0.01, "range-rate-bias": 1.0}  # m, 1, rad, m/s
 
 
 def _priors(effects: Sequence[OrbitEffect], problem: Problem) -> tuple[Prior, ...]:
@@ -109,6 +118,7 @@ class KeptEffect:
         proof: what is lost without it.
         utc: time of a manoeuvre; "" for others.
         reference: where the formula comes from.
+        open: the direction in which the data leave a manoeuvre open, in words; "" where there is none.
     """
 
     name: str
@@ -117,6 +127,7 @@ class KeptEffect:
     proof: _Proof
     utc: str
     reference: str
+    open: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +140,7 @@ class KeptExplanation:
         model: the data; found: the search; fit: the joint fit with every effect; plain: one orbit without any.
         effects: largest first.
         undetermined: numbers of the calibration that the data leave open, in words.
+        rejected: names that helped somewhere and were not believed, with the reason; missed: samples in no arc.
         rms: root mean square by channel of the fitted and the held-out data, before and after everything.
     """
 
@@ -146,6 +158,8 @@ class KeptExplanation:
     why: str
     seconds: float
     arcs: tuple[KeptExplanation, ...] = ()
+    rejected: tuple[str, ...] = ()
+    missed: int = 0
 
     def as_dict(self) -> dict[str, Any]:
         """The machine-readable answer of ``boresight orbit explain``."""
@@ -170,24 +184,53 @@ class KeptExplanation:
                 {"channel": c, "rms": fitted, "held_out_rms": held, "unit": unit, "common_error": self.structure}
                 for c, (fitted, held, unit) in self.after.items()
             ],
+            "left_where": self.left_where(),
+            "rejected": list(self.rejected),
             "undetermined": list(self.undetermined),
             "manoeuvres": sum(e.name.startswith(FAMILY) for e in self.effects),
-            "spans": [
-                [utc_text(self.model.epoch + np.timedelta64(round(t * 1e6), "us")) for t in (p.found.low, p.found.high)]
+            "spans": [[self._utc(p.found.low), self._utc(p.found.high)] for p in self.arcs],
+            "arcs": [
+                {
+                    "from": self._utc(p.found.low),
+                    "to": self._utc(p.found.high),
+                    "manoeuvres": sum(e.name.startswith(FAMILY) for e in p.effects),
+                    "measurements": p.fit.rows,
+                    "left": {c: {"rms": a, "held_out_rms": b, "unit": u} for c, (a, b, u) in p.after.items()},
+                }
                 for p in self.arcs
             ],
+            "measurements_in_no_arc": self.missed,
             "seconds": self.seconds,
         }
+
+    def _utc(self, seconds: float) -> str:
+        return utc_text(self.model.epoch + np.timedelta64(round(seconds * 1e6), "us"))
+
+    def left_where(self) -> list[dict[str, Any]]:
+        """Where what is left is far above the noise: runs of revolutions, the worst first, as in ``where``."""
+        found: list[dict[str, Any]] = []
+        for piece in self.arcs or (self,):
+            found += [{**w, "from": self._utc(w["from"]), "to": self._utc(w["to"])} for w in _remains(piece)]
+        found.sort(key=lambda w: float(w["excess"]), reverse=True)
+        for w in found:
+            w["sentence"] = (f"{w['channel']}, {w['from'][:16]} to {w['to'][:16]}: {w['excess']:.3g} {w['unit']} RMS, "
+                             f"{100 * w['shared']:.0f} % of it the same at all stations, slower than "
+                             f"{w['time_scale_s'] / 3600:.2g} h")
+        return found[:_WORST]
 
     @property
     def next_measurement(self) -> str:
         """What would separate what these data cannot."""
+        words = []
         if self.undetermined:
-            return (
-                "ranges from a station on another continent, or angles, over one revolution, to separate "
-                + ", ".join(self.undetermined)
-            )
-        return "" if self.verdict == "named" else "ranges more often than the burns last, around their times"
+            words.append("ranges from a station on another continent, or angles, over one revolution, to separate "
+                         + ", ".join(self.undetermined))
+        open_ = [e for e in self.effects if e.open]
+        if self.verdict != "named" or open_:
+            times = ", ".join(e.utc[:16] for e in open_[:_WORST])
+            words.append("ranges more often than the burns last, around their times"
+                         + (f" (of these least is known of {times})" if times else ""))
+        return "; ".join(words)
 
     def __str__(self) -> str:
         lines = [f"{self.verdict}: {self.why}", ""]
@@ -199,7 +242,11 @@ class KeptExplanation:
                              if n != "time")
             held = "; ".join(f"{a:.4g} -> {b:.4g}" for a, b in e.proof.held_out.values())
             lines.append(f"{e.name:<36}{e.utc[:19]:<22}{size}   {held}")
+            if e.open:
+                lines.append(f"{'':<36}{e.open}")
         lines += ["", *(f"left in {c}: {a:.3g} {u} RMS, held out {b:.3g} {u}" for c, (a, b, u) in self.after.items())]
+        lines += [f"left: {w['sentence']}" for w in self.left_where()]
+        lines += [f"not believed: {w}" for w in self.rejected]
         if self.undetermined:
             lines.append("not determined by these data: " + ", ".join(self.undetermined))
         return "\n".join(lines)
@@ -222,6 +269,8 @@ def _entry(e: KeptEffect) -> dict[str, Any]:
     }
     if e.utc:
         entry["time_utc"] = e.utc
+    if e.open:
+        entry["undetermined"] = e.open
     return entry
 
 
@@ -280,25 +329,68 @@ def explained_kept(model: OrbitModel, *, hold_out: float = 0.2, without: Sequenc
         return None
     model = replace(model, finite_burns=True)
     effects = calibration(model, without)
-    pieces: list[KeptExplanation] = []
+    arcs: list[tuple[OrbitModel, Found]] = []
     spans = [(first, last)]
-    while spans and len(pieces) < _MOST_ARCS:
+    known: dict[str, float] = {}
+    while spans and len(arcs) < _MOST_ARCS:
         low, high = spans.pop(0)
         if high - low < _SHORTEST_SPAN * period:
             continue
         part = _between(model, low, high)
         problem = _with_held_out(orbit_problem(part, [e.name for e in effects]), period, hold_out)
-        search = Search(problem, _priors(effects, problem), period, say)
+        search = Search(problem, _priors(effects, problem), period, say, known)
         try:
             found = search.run(state, 0.0)
         except InputError:
             continue
+        known = known or dict(found.noise)
         # What one orbit does not fit is looked at by itself.
         spans += [(low, found.low - 1.0), (found.high + 1.0, high)]
-        pieces.append(_concluded(_between(model, found.low, found.high), found, effects, without, hold_out, say))
-    if not any(p.found.names for p in pieces):
+        if found.fit.square < _FITS * found.fit.degrees:
+            arcs.append((_between(model, found.low, found.high), found))
+    if not any(found.names for _, found in arcs):
         return None
-    return _merged(model, pieces, time.perf_counter() - began)
+    offers = [_further(part, found, effects, without, hold_out, say) for part, found in arcs]
+    believed, rejected = consistent(offers, sorted((part.span for part, _ in arcs)))
+    pieces = []
+    for (part, found), offer in zip(arcs, offers, strict=True):
+        names = [n for n in offer if n in believed]
+        pieces.append(_concluded(part, found, effects, names, hold_out, say))
+    samples = sum(len(o.time) for o in model.tracking.observations)
+    missed = samples - sum(len(o.time) for part, _ in arcs for o in part.tracking.observations)
+    return _merged(model, pieces, rejected, missed, time.perf_counter() - began)
+
+
+Offer = dict[str, tuple[np.ndarray, np.ndarray]]
+"""Sizes and sigmas of the effects that an arc asks for beside manoeuvres and calibration, by name."""
+
+
+def consistent(offers: Sequence[Offer], arcs: Sequence[tuple[float, float]]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names that successive arcs ask for alike, and a sentence for every other.
+
+    A force or a clock that the model lacks is there in every arc and of one size. What one arc alone asks for, or two
+    with different sizes, stands in for something else: a burn that was not found, sunlight on a shape that the model
+    does not know.
+
+    Args:
+        offers: by arc.
+        arcs: their spans, s; with one alone there is nothing to compare.
+    """
+    believed, rejected = [], []
+    for name in dict.fromkeys(n for o in offers for n in o):
+        found = [o[name] for o in offers if name in o]
+        text = "; ".join(", ".join(f"{v:.3g} +- {s:.1g}" for v, s in zip(*f, strict=True)) for f in found)
+        if len(arcs) > 1 and len(found) == 1:
+            rejected.append(f"{name} helps in one arc of {len(arcs)} alone ({text}): burns that were not found or "
+                            "sunlight on a shape that the model does not know, not this")
+            continue
+        alike = all(np.all(np.abs(a[0] - b[0]) < _SURE * np.hypot(a[1], b[1])) for a in found for b in found)
+        if not alike:
+            rejected.append(f"{name} has another size in every arc ({text}): burns not found or sunlight on a "
+                            "shape that the model does not know, not this")
+            continue
+        believed.append(name)
+    return tuple(believed), tuple(rejected)
 
 
 def _between(model: OrbitModel, low: float, high: float) -> OrbitModel:
@@ -308,7 +400,8 @@ def _between(model: OrbitModel, low: float, high: float) -> OrbitModel:
     return model.thinned(masks)
 
 
-def _merged(model: OrbitModel, pieces: Sequence[KeptExplanation], seconds: float) -> KeptExplanation:
+def _merged(model: OrbitModel, pieces: Sequence[KeptExplanation], rejected: Sequence[str], missed: int,
+            seconds: float) -> KeptExplanation:
     """One answer from those of successive arcs: all manoeuvres, the other effects of the longest arc."""
     longest = max(pieces, key=lambda p: p.fit.rows)
     moves = sorted((e for p in pieces for e in p.effects if e.name.startswith(FAMILY)), key=lambda e: e.utc)
@@ -332,9 +425,57 @@ def _merged(model: OrbitModel, pieces: Sequence[KeptExplanation], seconds: float
     before, after = pooled([p.before for p in pieces]), pooled([p.after for p in pieces])
     structure = float(np.sum(rows * [p.structure for p in pieces]) / rows.sum())
     ratio = float(np.sqrt(np.sum(rows * [p.ratio**2 for p in pieces]) / rows.sum()))
-    verdict, why = _verdict(effects, after, structure, ratio, len(moves))
-    return replace(longest, model=model, before=before, after=after, structure=structure, ratio=ratio,
-                   effects=tuple(effects), verdict=verdict, why=why, seconds=seconds, arcs=tuple(pieces))
+    noise = pooled([_noise(p.found, p.fit) for p in pieces])
+    rejected = [*rejected, *dict.fromkeys(w for p in pieces for w in p.rejected)]
+    merged = replace(longest, model=model, before=before, after=after, structure=structure, ratio=ratio,
+                     effects=tuple(effects), seconds=seconds, arcs=tuple(pieces), rejected=tuple(rejected),
+                     missed=missed)
+    verdict, why = _verdict(merged, {c: v[0] for c, v in noise.items()})
+    return replace(merged, verdict=verdict, why=why)
+
+
+def _noise(found: Found, fit: Fit) -> dict[str, tuple[float, float, str]]:
+    """Noise of quiet data by channel, twice, and its unit."""
+    answer = {}
+    for r in fit.problem.residuals:
+        assert isinstance(r, KernelResidual)
+        size = found.noise.get(r.channel, 1.0) * float(np.median(r.standard_deviation))
+        answer[r.channel] = (size, size, r.unit)
+    return answer
+
+
+def _remains(piece: KeptExplanation) -> list[dict[str, Any]]:
+    """Runs of revolutions in which what is left is three times the noise or more, fitted and held-out data."""
+    fit, period = piece.fit, piece.found.search.period
+    found: list[dict[str, Any]] = []
+    noise = _noise(piece.found, fit)
+    for channel, (size, _, unit) in noise.items():
+        rows = [(r.time, p.residual) for r, p in zip(fit.problem.residuals, fit.parts, strict=True)
+                if isinstance(r, KernelResidual) and r.channel == channel]
+        when = np.concatenate([np.repeat(t, v.shape[1]) for t, v in rows])
+        value = np.concatenate([v.ravel() for _, v in rows])
+        stations = [r.name for r in fit.problem.residuals if isinstance(r, KernelResidual) and r.channel == channel]
+        turn = np.floor((when - when.min()) / period).astype(int)
+        square, count = np.bincount(turn, value**2), np.maximum(np.bincount(turn), 1)
+        loud = np.flatnonzero(np.sqrt(square / count) > max(_SURE * size, _METRE.get(channel, 0.0)))
+        for run in np.split(loud, np.flatnonzero(np.diff(loud) > 1) + 1) if len(loud) else []:
+            inside = (turn >= run[0]) & (turn <= run[-1])
+            t, v = when[inside], value[inside]
+            width = period / 48
+            bins, index = np.unique(np.round(t / width), return_inverse=True)
+            count_, total = np.bincount(index), np.bincount(index, v)
+            mean, power = total / count_, float(np.mean(v**2))
+            change = float(np.mean(np.diff(mean) ** 2)) if len(mean) > 1 else 0.0
+            step = float(np.median(np.diff(bins))) * width if len(bins) > 1 else period
+            # A wave of angular rate w that is sampled at steps dt changes by w dt of its size in a step.
+            rate = float(np.sqrt(change / max(float(np.mean(mean**2)), 1e-300))) / step
+            scale = min(1.0 / max(rate, 1e-300), float(np.ptp(t)) + step)
+            pairs = float(np.sum(count_ * (count_ - 1)))
+            alike = float(np.sum(total**2 - np.bincount(index, v**2))) / max(pairs, 1.0) / max(power, 1e-300)
+            found.append({"channel": channel, "arcs": stations, "from": float(t.min()), "to": float(t.max()),
+                          "unit": unit, "excess": float(np.sqrt(power)), "time_scale_s": scale,
+                          "shared": min(max(alike, 0.0), 1.0)})
+    return found
 
 
 def _with_held_out(problem: Problem, period: float, hold_out: float) -> Problem:
@@ -361,14 +502,14 @@ def _with_manoeuvres(model: OrbitModel, found: Found, effects: Sequence[str], ca
 
 
 def _further(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], without: Sequence[str], hold_out: float,
-             say: Say) -> list[str]:
-    """Names of other effects of the library that the joint fit still misses, best first."""
+             say: Say) -> Offer:
+    """Effects of the library that the joint fit still misses, best first: sizes and sigmas to first order."""
     fit, noise = found.fit, found.noise
     covered = {"range-bias", FAMILY, *(e.family for e in own if e.family in ("angle-bias", "range-rate-bias"))}
     offered = [e for e in instances(model.layout) if e.family not in covered and e not in own
                and e.name not in without and e.family not in without]
     if not offered:
-        return []
+        return {}
     say("scores of the library")
     names = [e.name for e in offered]
     problem, point = _with_manoeuvres(model, found, [e.name for e in own], names, hold_out)
@@ -421,12 +562,60 @@ def _further(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], withou
             break
         chosen_.append(best[1])
         columns += best[2]
-    return chosen_
+    if not chosen_:
+        return {}
+    upper = np.asarray(np.linalg.qr(np.vstack([wide.jacobian[:, columns], wide.prior[:, columns],
+                                               1e-9 * np.eye(len(columns))]), mode="r"))
+    everything = np.concatenate([wide.residual, wide.off])
+    stacked = np.vstack([wide.jacobian[:, columns], wide.prior[:, columns]])
+    inverse = np.linalg.inv(upper)
+    step = -inverse @ (inverse.T @ (stacked.T @ everything)) * wide.scales[columns]
+    sigma = np.sqrt(np.sum(inverse**2, axis=1) * level) * wide.scales[columns]
+    place = {c: k for k, c in enumerate(columns)}
+    answer: Offer = {}
+    for name in chosen_:
+        own_places = [place[c] for c in np.arange(wide.jacobian.shape[1])[wide.columns(name)]]
+        answer[name] = (step[own_places], sigma[own_places])
+    return answer
 
 
-def _concluded(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], without: Sequence[str], hold_out: float,
+def _concluded(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], further: Sequence[str], hold_out: float,
                say: Say) -> KeptExplanation:
-    further = _further(model, found, own, without, hold_out, say)
+    """The joint fit with the effects that were chosen, and the proof of each.
+
+    What the held-out passes do not speak for leaves, and the rest is fitted once more.
+    """
+    answer = _proved(model, found, own, further, hold_out, say)
+    proved = {e.name for e in answer.effects if _held(e)}
+    unproved = [n for n in further if n not in proved]
+    weak = set()
+    for e in answer.effects:
+        if e.name.startswith(FAMILY):
+            sizes = [e.parameters[k] for k in ("radial", "along", "cross")]
+            none = all(abs(v["value"]) < _SURE * v["sigma"] for v in sizes)
+            if e.proof.p_value > LEVEL or (none and not _held(e)):
+                weak.add(e.name)
+    if not unproved and not weak:
+        return answer
+    kept = [(n, m) for k, (n, m) in enumerate(zip(found.names, found.manoeuvres, strict=True))
+            if f"{FAMILY}:{k + 1}" not in weak]
+    fewer = replace(found, names=tuple(n for n, _ in kept), manoeuvres=tuple(m for _, m in kept))
+    again = _proved(model, fewer, own, [n for n in further if n not in unproved], hold_out, say)
+    if weak and again.fit.square > _NEEDED * answer.fit.square:
+        # Something was there after all; what it is these data do not tell.
+        again = answer
+        if unproved:
+            again = _proved(model, found, own, [n for n in further if n not in unproved], hold_out, say)
+    return replace(again, rejected=tuple(f"{n} makes the held-out passes no better" for n in unproved))
+
+
+def _held(e: KeptEffect) -> bool:
+    """Whether the held-out data are better with an effect than without."""
+    return any(b < a for a, b in e.proof.held_out.values())
+
+
+def _proved(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], further: Sequence[str], hold_out: float,
+            say: Say) -> KeptExplanation:
     every = (*own, *chosen(model.layout, further))
     say("joint fit with " + (", ".join(further) or "nothing further"))
     problem, point = _with_manoeuvres(model, found, [e.name for e in every], (), hold_out)
@@ -435,10 +624,8 @@ def _concluded(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], with
         if e not in own:
             priors.append(Prior.of(e.name, np.zeros(len(e.parameters)), np.array([10 * p.scale for p in e.parameters])))
     for name, m in zip(found.names, found.manoeuvres, strict=True):
-        sigma = [found.search.period / 8, 50.0, 50.0, 50.0, *([found.search.period / 4] if m.burning else [])]
-        mean = [m.time, 0.0, 0.0, 0.0, *([m.duration] if m.burning else [])]
-        priors.append(Prior.of(name, np.array(mean), np.array(sigma)))
-    fit = gauss_newton(problem, point, priors, found.noise, iterations=5, enough=1e-4)
+        priors.append(found.search.prior_of(name, m))
+    fit = gauss_newton(problem, point, priors, found.noise, iterations=15, enough=1e-4)
     say("one orbit without manoeuvres")
     first, last = model.span
     bare = _with_held_out(orbit_problem(model, [e.name for e in own]), found.search.period, hold_out)
@@ -452,8 +639,10 @@ def _concluded(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], with
     after, ratio_after = _misfit(seen, still, found.noise)
     held_after, held_ratio = _misfit(held, still, found.noise)
     covariance = fit.covariance()
-    level = max(1.0, fit.square / fit.degrees) * found.shared
-    # The sigmas that are reported include errors that measurements share, and scatter above the measured noise.
+    # The sigmas that are reported include scatter above the measured noise and errors that measurements share, in quiet
+    # data or in what is left here: slow errors of a model leave far less to learn than their number of rows.
+    structure = common_error(fit)
+    level = max(1.0, fit.square / fit.degrees) * max(found.shared, structure)
     spread = np.sqrt(np.diag(covariance) * level)
     places = (last - first) / found.search.period * 48
     effects = []
@@ -472,45 +661,92 @@ def _concluded(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], with
                       {k: (v, held_after[k]) for k, v in held_out.items()},
                       (ratio, ratio_after, held_before, held_ratio))
 
-    named = {n: f"{FAMILY}:{k + 1}" for k, n in enumerate(found.names)}
-    for n in found.names:
-        c = fit.columns(n)
-        values = fit.values[n]
-        fixed = [c.start, *([c.start + 4] if len(values) == 5 else [])]
-        labels, units = ("time", "radial", "along", "cross", "duration"), ("s", "m/s", "m/s", "m/s", "s")
-        parameters = {p: {"value": float(v), "sigma": float(s), "unit": u}
-                      for p, v, s, u in zip(labels, values, spread[c], units, strict=False)}
-        instant = model.epoch + np.timedelta64(round(float(values[0]) * 1e6), "us")
-        proof = proved([c.start + 1, c.start + 2, c.start + 3], fixed, values[1:4], places)
-        effects.append(KeptEffect(named[n], (named[n],), parameters, proof, utc_text(instant),
-                                  "a burn of constant acceleration in orbital axes" if len(values) == 5 else
-                                  "a burn short against the orbit"))
+    labels, units = ("time", "radial", "along", "cross", "duration"), ("s", "m/s", "m/s", "m/s", "s")
+    steps = {n: Manoeuvre.of(fit.values[n]) for n in found.names}
+    for members in _told_together(fit, steps, spread, found):
+        first_columns = [fit.columns(n).start for n in members]
+        values = np.concatenate([fit.values[n][1:4] for n in members])
+        fixed = [c.start + k for c in map(fit.columns, members) for k in (0, 4)[: c.stop - c.start - 3]]
+        velocity_columns = [c + k for c in first_columns for k in (1, 2, 3)]
+        total = sum((steps[n].velocity for n in members), np.zeros(3))
+        adding = np.tile(np.eye(3), len(members))
+        block = adding @ covariance[np.ix_(velocity_columns, velocity_columns)] @ adding.T * level
+        numbers: list[tuple[str, float, float, str]]
+        if len(members) == 1:
+            numbers = list(zip(labels, fit.values[members[0]], spread[fit.columns(members[0])], units, strict=False))
+        else:
+            when = np.array([steps[n].time for n in members])
+            wide = float(max(np.ptp(when), min(spread[c] for c in first_columns)))
+            numbers = [("time", float(when.mean()), wide, "s")]
+            numbers += [(p, float(v), float(s), "m/s")
+                        for p, v, s in zip(labels[1:4], total, np.sqrt(np.diag(block)), strict=True)]
+        parameters: dict[str, dict[str, Any]] = {p: {"value": float(v), "sigma": float(s), "unit": u}
+                                                 for p, v, s, u in numbers}
+        instant = model.epoch + np.timedelta64(round(parameters["time"]["value"] * 1e6), "us")
+        proof = proved(velocity_columns, fixed, values, places)
+        name = f"{FAMILY}:{found.names.index(members[0]) + 1}"
+        reference = "a burn of constant acceleration in orbital axes" if steps[members[0]].burning else (
+            "a burn short against the orbit")
+        if len(members) > 1:
+            reference = f"{len(members)} burns that these data cannot tell apart: the sum of their velocities"
+        effects.append(KeptEffect(name, (name,), parameters, proof, utc_text(instant), reference, _open(total, block)))
     flat = _without_prior(fit, [e.name for e in own if e.family == "range-bias"])
+    together: tuple[str, ...] = ()
+    for e in every:
+        biases = tuple(o.name for o in own if o.family == "range-bias")
+        if e.family == "range-scale-error" and biases:
+            at = fit.columns(e.name).start
+            if chi2.sf(float(fit.values[e.name][0] ** 2 / flat[at] / level), 1) > LEVEL:
+                together = (e.name, *biases)
     for e in every:
         c = fit.columns(e.name)
         values = fit.values[e.name]
         parameters = {p.name: {"value": float(v), "sigma": float(s), "unit": p.unit}
                       for p, v, s in zip(e.parameters, values, spread[c], strict=True)}
         proof = proved(list(range(c.start, c.stop)), [], values, len(every))
-        if proof.p_value > LEVEL:
-            continue
         group: tuple[str, ...] = (e.name,)
-        if e.family == "range-scale-error":
-            alone = float(values[0] ** 2 / flat[c.start] / level)
-            if chi2.sf(alone, 1) > LEVEL:
-                group = (e.name, *(o.name for o in own if o.family == "range-bias"))
+        if e.name in together:
+            # Neither means anything without the other: they are taken away at once.
+            group = (e.name, *(n for n in together if n != e.name))
+            columns = [k for n in together for k in range(fit.columns(n).start, fit.columns(n).stop)]
+            proof = proved(columns, [], np.concatenate([np.atleast_1d(fit.values[n]) for n in together]), len(every))
+        if proof.p_value > LEVEL or not any(b < a for a, b in proof.held_out.values()):
+            continue
         effects.append(KeptEffect(e.name, group, parameters, proof, "", e.reference))
     effects.sort(key=lambda e: -e.proof.score)
     undetermined = _undetermined(fit, every, found)
     unit_of = {r.channel: r.unit for r in fit.problem.residuals}
     before_seen = _misfit(_rows(plain, found.noise, held_out=False), np.zeros(plain.jacobian.shape[1]), found.noise)[0]
     before_held = _misfit(_rows(plain, found.noise, held_out=True), np.zeros(plain.jacobian.shape[1]), found.noise)[0]
-    structure = common_error(fit)
     ends = {c: (v, held_after.get(c, float("nan")), unit_of[c]) for c, v in after.items()}
     begins = {c: (v, before_held.get(c, float("nan")), unit_of[c]) for c, v in before_seen.items()}
-    verdict, why = _verdict(effects, ends, structure, ratio_after, len(found.names))
     return KeptExplanation(model, found, fit, plain, begins, ends, structure, ratio_after, tuple(effects), undetermined,
-                           verdict, why, 0.0)
+                           "unknown", "", 0.0)
+
+
+def _told_together(fit: Fit, steps: dict[str, Manoeuvre], spread: np.ndarray, found: Found) -> list[list[str]]:
+    """Manoeuvres by name, those together that the data cannot tell apart."""
+    unsure = {n for n in steps if np.all(np.abs(fit.values[n][1:4])
+                                         < _SURE * spread[fit.columns(n).start + 1 : fit.columns(n).start + 4])}
+    pairs = {p for p in neighbours(steps, {n: float(spread[fit.columns(n).start]) for n in steps}, found.search.times)
+             if unsure & set(p)}
+    groups: list[list[str]] = []
+    for n in sorted(steps, key=lambda n: steps[n].time):
+        if groups and (groups[-1][-1], n) in pairs:
+            groups[-1].append(n)
+        else:
+            groups.append([n])
+    return groups
+
+
+def _open(velocity: np.ndarray, covariance: np.ndarray) -> str:
+    """The direction in which a velocity step (3,) with a covariance (3, 3) is open, in words."""
+    values, vectors = np.linalg.eigh(covariance)
+    sigma, axis = float(np.sqrt(max(values[-1], 0.0))), vectors[:, -1]
+    if sigma < _SPREAD * float(np.linalg.norm(velocity)):
+        return ""
+    parts = [f"{x:+.2f} {n}" for x, n in zip(axis, ("radial", "along", "cross"), strict=True) if abs(x) > 0.1]
+    return f"its velocity along {' '.join(parts)} is known to {1e3 * sigma:.3g} mm/s only"
 
 
 def _without_prior(fit: Fit, names: Sequence[str]) -> np.ndarray:
@@ -544,19 +780,28 @@ def _undetermined(fit: Fit, effects: Sequence[OrbitEffect], found: Found) -> tup
     return tuple(words)
 
 
-def _verdict(effects: Sequence[KeptEffect], after: dict[str, tuple[float, float, str]], structure: float, ratio: float,
-             manoeuvres: int) -> tuple[str, str]:
+def _verdict(answer: KeptExplanation, noise: dict[str, float]) -> tuple[str, str]:
+    """The word and its sentence; ``noise`` is that of quiet data by channel."""
+    effects, after = answer.effects, answer.after
+    manoeuvres = sum(e.name.startswith(FAMILY) for e in effects)
     others = ", ".join(e.name if len(e.group) == 1 else " or ".join(e.group) for e in effects
                        if not e.name.startswith(FAMILY))
     missing = f"{manoeuvres} manoeuvres" if manoeuvres > 1 else "one manoeuvre"
     missing += f" and {others}" if others else ""
-    left = "; ".join(f"{a:.3g} {u} RMS in {c.replace('_', ' ')} ({b:.3g} {u} in data no fit has seen)"
-                     for c, (a, b, u) in after.items())
-    if ratio > 1.5:
-        return "unknown", f"missing were {missing}; the library holds no explanation of the rest: {left}"
+    left = "; ".join(f"{a:.3g} {u} RMS in {c.replace('_', ' ')} ({b:.3g} {u} in data no fit has seen, noise of quiet "
+                     f"data {noise[c]:.2g} {u})" for c, (a, b, u) in after.items())
+    loud = any(np.nanmax([a, b]) > max(_NAMED * noise[c], _METRE.get(c, 0.0)) for c, (a, b, _) in after.items())
+    if loud or answer.missed:
+        why = f"missing were {missing}; the library holds no explanation of the rest: {left}"
+        if answer.missed:
+            why += f"; {answer.missed} measurements lie in stretches too short or too disturbed for an orbit"
+        places = answer.left_where()
+        if places:
+            why += f"; most in {places[0]['sentence']}"
+        return "unknown", why
     tail = f"left is {left}"
-    if structure > 3.0:
-        tail += ", below the declared noise, but shared by stations or slow"
+    if answer.structure > _SURE:
+        tail += ", but shared by stations or slow"
     if any(len(e.group) > 1 for e in effects):
         return "ambiguous", f"missing were {missing}, of which the data cannot tell apart those with an or; {tail}"
     return "named", f"missing were {missing}; {tail}"

@@ -21,9 +21,10 @@ that of the settings.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -58,6 +59,10 @@ _BROKEN = 16.0  # mean square over that of quiet data beyond which one orbit doe
 _EDGE_STEP = 3600.0  # s that an edge of a burn moves in the first step of a fit
 _FASTEST = 50.0  # m/s, prior sigma of a velocity step
 _LONGEST = 0.25  # revolutions, prior sigma of the duration of a burn
+_ROUGHEST = 4.0  # mean square over that of quiet data that growing fits may make the measure of the joint fit
+_SURE = 3.0  # sigmas
+_ALIKE = 0.3  # relative sigma of the length of a burn about that of the others in the same direction
+_NOISIER = 1.5  # factor on the noise of all data that the quiet stretches of a part of them may reach
 
 
 @dataclass(frozen=True, eq=False)
@@ -453,17 +458,22 @@ class Search:
         priors: of unknowns other than the state.
         period: of the orbit, s.
         say: called with what is being done.
+        usual: length of the burns across the orbit's plane, s, once it is found; 0 before.
+        known: noise by channel that the quiet stretches of a longer span have told, as a factor on the declared one:
+            where burns leave no quiet stretch, a fit that misses them must not pass for noise.
     """
 
     problem: Problem
     priors: tuple[Prior, ...]
     period: float
     say: Say = lambda text: None
+    known: Mapping[str, float] = field(default_factory=dict)
     noise: dict[str, float] = field(default_factory=dict)
     looks: int = 0
     level: float = 1.0
     shared: float = 1.0
     calibrated: bool = False
+    usual: float = 0.0
 
     def __post_init__(self) -> None:
         first = self.problem.residuals[0]
@@ -474,6 +484,7 @@ class Search:
         times = [r.time[r.accepted] if r.accepted is not None else r.time for r in self._residuals]
         self.times = np.unique(np.concatenate(times))
         self._names = 0
+        self._grids: dict[Any, Any] = {}  # steps of the integration, shared by all stretches
 
     @property
     def _residuals(self) -> list[KernelResidual]:
@@ -483,7 +494,8 @@ class Search:
                 everything: bool = False) -> tuple[Problem, OrbitArc]:
         """The problem of the data between two times, with the state at ``start`` and velocity steps by name."""
         made = tuple(VelocityStep(m.unknown(n), burning=m.burning) for n, m in steps.items())
-        arc = replace(self.arc, start=start, span=(low, high), steps=made, tolerance=_LOOSE, _grids={}, _last={})
+        arc = replace(self.arc, start=start, span=(low, high), steps=made, tolerance=_LOOSE, _grids=self._grids,
+                      _last={})
         residuals = []
         for r in self._residuals:
             keep = (r.time >= low) & (r.time <= high)
@@ -505,10 +517,17 @@ class Search:
         point[arc.position.name], point[arc.velocity.name] = state[:3], state[3:]
         priors = list(self.priors)
         for n, m in steps.items():
-            sigma = [self.period / 8, _FASTEST, _FASTEST, _FASTEST, *([_LONGEST * self.period] if m.burning else [])]
-            mean = [m.time, 0.0, 0.0, 0.0, *([m.duration] if m.burning else [])]
-            priors.append(Prior.of(n, np.array(mean), np.array(sigma)))
+            priors.append(self.prior_of(n, m))
         return gauss_newton(problem, point, priors, self.noise, **options), arc
+
+    def prior_of(self, name: str, m: Manoeuvre) -> Prior:
+        """What is known of a manoeuvre before the fit: about when, and how long where others told."""
+        mean, sigma = [m.time, 0.0, 0.0, 0.0], [self.period / 8, _FASTEST, _FASTEST, _FASTEST]
+        if m.burning:
+            usual = self.usual > 0 and _northward(m)
+            mean.append(self.usual if usual else m.duration)
+            sigma.append(_ALIKE * self.usual if usual else _LONGEST * self.period)
+        return Prior.of(name, np.array(mean), np.array(sigma))
 
     # ------------------------------------------------------------------------------------------------ quiet stretches
 
@@ -553,7 +572,8 @@ class Search:
                                        if isinstance(r, KernelResidual) and r.channel == channel] or [np.zeros(0)])
                 if len(rows):
                     squares.append(float(np.mean(rows**2)) * fit.rows / fit.degrees)
-            self.noise[channel] = float(np.sqrt(np.median(squares))) if squares else 1.0
+            measured = float(np.sqrt(np.median(squares))) if squares else 1.0
+            self.noise[channel] = min(measured, _NOISIER * self.known.get(channel, np.inf))
         self.shared = float(np.median([common_error(item[3]) for item in quarter]))
         return found[0][1], found[0][2], found[0][3]
 
@@ -681,6 +701,7 @@ class Search:
             fit, arc = best[1:]
             steps = {s.unknown.name: Manoeuvre.of(fit.values[s.unknown.name]) for s in arc.steps}
         fit, arc, steps = self._pruned(fit, arc, _steps_of(fit, steps), low, high)
+        # Growth goes on over what it does not fit yet; the joint fit, which is stricter, has the last word.
         self.level = max(1.0, 0.5 * self.level + 0.5 * min(fit.square / fit.degrees, 2 * self.level))
         return fit, arc, steps
 
@@ -719,17 +740,10 @@ class Search:
         steps = {**after, **before}
         self.priors = declared
         fit, arc, steps, since, until = self._joined(quiet, steps, low, high, since, until)
-        for _ in range(6):
-            weak = self._weak(fit, steps)
-            if not weak:
-                break
-            changed = {n: weak.get(n, m) for n, m in steps.items()}
-            kept = {n: m for n, m in changed.items() if m is not None}
-            again, new_arc = self.fit(since, until, arc.start, _state(fit, arc), fit.values, kept, iterations=15,
-                                      enough=1e-3)
-            if again.square / again.degrees > 2.0 * fit.square / fit.degrees:
-                break  # it was needed after all
-            fit, arc, steps = again, new_arc, _steps_of(again, kept)
+        fit, arc, steps = self._alike(fit, arc, steps, since, until)
+        fit, arc, steps = self._thinned(fit, arc, steps, since, until)
+        fit, arc, steps = self._parted(fit, arc, steps, since, until)
+        fit, arc, steps = self._thinned(fit, arc, steps, since, until)
         ordered = sorted(steps.items(), key=lambda item: item[1].time)
         return Found(fit, arc, since, until, tuple(n for n, _ in ordered), tuple(m for _, m in ordered),
                      dict(self.noise), self.shared, self.looks, self)
@@ -754,21 +768,86 @@ class Search:
                 self.say(f"one orbit over {(tried[1] - tried[0]) / 86400:.1f} days, {len(inside)} manoeuvres")
                 again, new_arc = self.fit(*tried, arc.start, _state(fit, arc), fit.values, inside, iterations=12,
                                           enough=1e-2)
-                if again.square / again.degrees > _BROKEN * self.level:
+                if again.square / again.degrees > _BROKEN * min(self.level, _ROUGHEST):
                     ends[direction] = edge
                     continue
                 fit, arc, taken = again, new_arc, _steps_of(again, inside)
                 a, b = tried
-        usual = float(np.median([m.duration for m in taken.values()] or [0.0]))
-        if usual > 0.005 * self.period:
-            # A burn that fell between two measurements may have been taken for an impulse at a wrong time: the same
-            # engine burns alike, so each gets a second chance from the others' duration.
-            alike = {n: replace(m, duration=usual) if not 0.4 * usual < m.duration < 2.5 * usual else m
-                     for n, m in taken.items()}
-            again, new_arc = self.fit(a, b, arc.start, _state(fit, arc), fit.values, alike, iterations=15, enough=1e-3)
-            if again.square < fit.square:
-                fit, arc, taken = again, new_arc, _steps_of(again, alike)
         return fit, arc, taken, a, b
+
+    def _alike(self, fit: Fit, arc: OrbitArc, steps: dict[str, Manoeuvre], low: float, high: float,
+               ) -> tuple[Fit, OrbitArc, dict[str, Manoeuvre]]:
+        """Give burns whose length was not found the length of the others.
+
+        The orbit feels the square of a burn's length, so that a fit that has come to a short one is stuck there; the
+        same engine in the same direction burns alike.
+        """
+        lengths = []
+        sigma = self._sigmas(fit, steps)
+        for n, m in steps.items():
+            if m.burning and m.duration > 5 * sigma[n][4] and _northward(m):
+                lengths.append(m.duration)
+        if not lengths or float(np.median(lengths)) < 0.005 * self.period:
+            return fit, arc, steps
+        before, self.usual = self.usual, float(np.median(lengths))
+        alike = {n: replace(m, duration=self.usual)
+                 if _northward(m) and not 0.6 * self.usual < m.duration < 1.6 * self.usual else m
+                 for n, m in steps.items()}
+        again, new_arc = self.fit(low, high, arc.start, _state(fit, arc), fit.values, alike, iterations=20, enough=1e-3)
+        # Lengths that the data leave open may as well be the usual one.
+        if again.square < 1.02 * fit.square:
+            return again, new_arc, _steps_of(again, alike)
+        self.usual = before
+        return fit, arc, steps
+
+    def _sigmas(self, fit: Fit, names: Iterable[str]) -> dict[str, np.ndarray]:
+        """Sigmas of the numbers of each manoeuvre, with the scatter and the shared errors that the fit shows."""
+        spread = np.sqrt(np.diag(fit.covariance()) * max(1.0, fit.square / fit.degrees) * self.shared)
+        return {n: spread[fit.columns(n)] for n in names}
+
+    def _thinned(self, fit: Fit, arc: OrbitArc, steps: dict[str, Manoeuvre], low: float, high: float,
+                 ) -> tuple[Fit, OrbitArc, dict[str, Manoeuvre]]:
+        """Without the manoeuvres that are not significant together with all others, impulses where length is open."""
+        for _ in range(6):
+            weak = self._weak(fit, steps)
+            if not weak:
+                break
+            # Lengths first: they cost nothing, and a drop that proves wrong must not undo them.
+            chosen = {n: m for n, m in weak.items() if m is not None} or weak
+            kept = {n: m for n, m in {n: chosen.get(n, m) for n, m in steps.items()}.items() if m is not None}
+            again, new_arc = self.fit(low, high, arc.start, _state(fit, arc), fit.values, kept, iterations=15,
+                                      enough=1e-3)
+            if again.square / again.degrees > 2.0 * fit.square / fit.degrees:
+                break  # it was needed after all
+            fit, arc, steps = again, new_arc, _steps_of(again, kept)
+        return fit, arc, steps
+
+    def _parted(self, fit: Fit, arc: OrbitArc, steps: dict[str, Manoeuvre], low: float, high: float,
+                ) -> tuple[Fit, OrbitArc, dict[str, Manoeuvre]]:
+        """One manoeuvre in place of neighbours that the data cannot tell apart, where one explains as much."""
+        tried: set[tuple[str, ...]] = set()
+        while True:
+            sigma = self._sigmas(fit, steps)
+            # Of two that are both sure in some direction each is needed, however near they are.
+            unsure = {n for n, m in steps.items() if np.all(np.abs(m.velocity) < _SURE * sigma[n][1:4])}
+            pairs = [p for p in neighbours(steps, {n: float(s[0]) for n, s in sigma.items()}, self.times)
+                     if p not in tried and unsure & set(p)]
+            if not pairs:
+                return fit, arc, steps
+            pair = pairs[0]
+            tried.add(pair)
+            best: tuple[float, Fit, OrbitArc, dict[str, Manoeuvre]] | None = None
+            total = sum((steps[n].velocity for n in pair), np.zeros(3))
+            for n in pair:
+                # The one may stand where either of them stood.
+                rest = {k: m for k, m in _steps_of(fit, steps).items() if k not in pair}
+                rest[n] = replace(steps[n], velocity=total)
+                score, again, new_arc = self._scored(rest, fit, arc, low, high)
+                if best is None or score < best[0]:
+                    best = score, again, new_arc, _steps_of(again, rest)
+            assert best is not None
+            if best[0] < _criterion(fit, self.shared):
+                fit, arc, steps = best[1:]
 
     def p_values(self, fit: Fit, names: Sequence[str]) -> dict[str, float]:
         """Probability of each manoeuvre's velocity without one, over all places where the search looked."""
@@ -805,6 +884,32 @@ class Search:
                 ) -> tuple[float, Fit, OrbitArc]:
         again, new_arc = self.fit(low, high, arc.start, _state(fit, arc), fit.values, steps, iterations=8, enough=1e-3)
         return _criterion(again, self.shared), again, new_arc
+
+
+def _northward(m: Manoeuvre) -> bool:
+    """Whether a manoeuvre turns the orbit's plane more than it changes its period."""
+    return abs(m.velocity[2]) > abs(m.velocity[1])
+
+
+def neighbours(steps: Mapping[str, Manoeuvre], sigma: Mapping[str, float], times: np.ndarray) -> list[tuple[str, str]]:
+    """Pairs of successive manoeuvres that the data cannot tell apart.
+
+    Args:
+        steps: by name.
+        sigma: of their times, s.
+        times: (n,) of the measurements, s, increasing.
+
+    Returns:
+        Names of two manoeuvres without a measurement between them, or nearer to each other than two sigmas of the
+        times, in the order of time.
+    """
+    found = []
+    for (a, first), (b, second) in pairwise(sorted(steps.items(), key=lambda item: item[1].time)):
+        apart = second.time - first.time
+        between = np.searchsorted(times, second.time) - np.searchsorted(times, first.time)
+        if between == 0 or apart < 2.0 * float(np.hypot(sigma[a], sigma[b])):
+            found.append((a, b))
+    return found
 
 
 def _criterion(fit: Fit, shared: float) -> float:
