@@ -29,6 +29,7 @@ from estimator.unknowns import Unknown, Vector
 
 _SAME_GRID = 1e-3  # relative change of the state at a segment's start up to which its grid is kept
 _EDGE = 3600.0  # s that the two ends of a segment may have moved together for its steps to be tried again
+_LOOSE = 1e-4  # m of error allowed per step from which steps may be carried over
 _GRIDS = 256  # segments of which the steps are kept
 
 
@@ -256,6 +257,8 @@ class OrbitArc:
         kept = known.get((a, b))
         if kept is not None:
             return kept[1] if _near(x, kept[0]) else None
+        if self.tolerance.absolute[0] < _LOOSE:
+            return None  # what is integrated to rounding has steps of its own
         close = [key for key in known if abs(key[0] - a) + abs(key[1] - b) < _EDGE and (key[1] - key[0]) * (b - a) > 0]
         for key in sorted(close, key=lambda key: abs(key[0] - a) + abs(key[1] - b))[:2]:
             made_for, grid = known[key]

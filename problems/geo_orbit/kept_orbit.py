@@ -51,6 +51,7 @@ _SPREAD = 0.3  # sigma over size of a velocity step beyond which a direction of 
 _SURE = 3.0  # sigmas
 _NEEDED = 1.1  # growth of the sum of squares that tells that what was dropped was needed
 _FITS = 64.0  # mean square over that of quiet data up to which a stretch counts as fitted
+_COMMON = "the part of"
 _WORST = 5  # places of what is left that are named
 _UNDETERMINED = 0.5  # posterior over prior sigma beyond which the data say nothing of a number
 
@@ -690,14 +691,12 @@ def _proved(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], further
         if len(members) > 1:
             reference = f"{len(members)} burns that these data cannot tell apart: the sum of their velocities"
         effects.append(KeptEffect(name, (name,), parameters, proof, utc_text(instant), reference, _open(total, block)))
-    flat = _without_prior(fit, [e.name for e in own if e.family == "range-bias"])
+    undetermined = _undetermined(fit, every, found)
     together: tuple[str, ...] = ()
-    for e in every:
-        biases = tuple(o.name for o in own if o.family == "range-bias")
-        if e.family == "range-scale-error" and biases:
-            at = fit.columns(e.name).start
-            if chi2.sf(float(fit.values[e.name][0] ** 2 / flat[at] / level), 1) > LEVEL:
-                together = (e.name, *biases)
+    biases = tuple(o.name for o in own if o.family == "range-bias")
+    scales = tuple(o.name for o in own if o.family == "range-scale-error")
+    if biases and scales and any(w.startswith(_COMMON) for w in undetermined):
+        together = (*scales, *biases)
     for e in every:
         c = fit.columns(e.name)
         values = fit.values[e.name]
@@ -714,7 +713,6 @@ def _proved(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], further
             continue
         effects.append(KeptEffect(e.name, group, parameters, proof, "", e.reference))
     effects.sort(key=lambda e: -e.proof.score)
-    undetermined = _undetermined(fit, every, found)
     unit_of = {r.channel: r.unit for r in fit.problem.residuals}
     before_seen = _misfit(_rows(plain, found.noise, held_out=False), np.zeros(plain.jacobian.shape[1]), found.noise)[0]
     before_held = _misfit(_rows(plain, found.noise, held_out=True), np.zeros(plain.jacobian.shape[1]), found.noise)[0]
@@ -749,15 +747,6 @@ def _open(velocity: np.ndarray, covariance: np.ndarray) -> str:
     return f"its velocity along {' '.join(parts)} is known to {1e3 * sigma:.3g} mm/s only"
 
 
-def _without_prior(fit: Fit, names: Sequence[str]) -> np.ndarray:
-    """Variances (p,) where nothing is assumed of the size of some unknowns."""
-    prior = fit.prior.copy()
-    for n in names:
-        touched = np.any(prior[:, fit.columns(n)] != 0, axis=1)
-        prior[touched] *= 1e-3
-    return np.diag(replace(fit, prior=prior).covariance())
-
-
 def _undetermined(fit: Fit, effects: Sequence[OrbitEffect], found: Found) -> tuple[str, ...]:
     """Numbers of which the data say little more than was assumed of their size, in words."""
     words = []
@@ -770,7 +759,7 @@ def _undetermined(fit: Fit, effects: Sequence[OrbitEffect], found: Found) -> tup
         if e.each and mean_sigma > 0.1 * width[0] / np.sqrt(len(width)):
             spread = block - block.mean(axis=0) - block.mean(axis=1)[:, None] + block.mean()
             words.append(
-                f"the part of {e.family} that all stations share ({mean_sigma:.3g} m; their differences to "
+                f"{_COMMON} {e.family} that all stations share ({mean_sigma:.3g} m; their differences to "
                 f"{np.sqrt(np.diag(spread)).max():.2g} m), against the scale of the ranges and the longitude"
             )
             continue

@@ -26,6 +26,9 @@ from problems.geo_orbit.settings import OrbitSettings
 from problems.geo_orbit.tracking import Tracking
 
 _FAR = 25.0  # mean whitened square above which a fit counts as far from the noise
+_LONG = 3.0  # revolutions over which a satellite may have manoeuvred
+_DISTURBED = 5.0  # median size over the noise beyond which the model misses long data, rather than single measurements
+_PATIENCE = 20  # iterations over long data that end far from the noise
 _SHOWN = {"rad": (np.degrees(1.0), "deg")}
 
 
@@ -193,6 +196,32 @@ def mean_square(estimate: Estimate) -> float:
     return total / max(count, 1.0)
 
 
+def _horizon_of(model: OrbitModel, revolutions: float) -> float:
+    """Time of some circular revolutions at the distance of the first position, s."""
+    radius = float(np.linalg.norm(model.position))
+    return revolutions * 2 * np.pi * float(np.sqrt(radius**3 / 3.986004418e14))  # m3/s2 of the Earth
+
+
+def _disturbed(model: OrbitModel, estimate: Estimate) -> bool:
+    """Whether the data span revolutions and most of them, not single ones, are far from the orbit."""
+    if model.span[1] - model.span[0] < _horizon_of(model, _LONG):
+        return False
+    sizes = [np.abs(p.whitened[p.weight > 0]).ravel() for p in estimate.parts]
+    size = float(np.median(np.concatenate(sizes)))
+    return not size < _DISTURBED
+
+
+def _within(problem: Problem, horizon: float) -> Problem:
+    """The problem of the data up to ``horizon`` (s) from the epoch."""
+    residuals = []
+    for r in problem.residuals:
+        assert isinstance(r, KernelResidual)
+        keep = np.abs(r.time) <= horizon
+        if keep.any():
+            residuals.append(r.subset(keep))
+    return problem.with_residuals(residuals)
+
+
 def solve_from_far(problem: Problem, model: OrbitModel, options: Options | None = None) -> Estimate:
     """Solve from a start that may be far: directly, and where that ends far from the noise, over a growing horizon.
 
@@ -200,8 +229,10 @@ def solve_from_far(problem: Problem, model: OrbitModel, options: Options | None 
         GeometryError: the start itself meets the Earth.
     """
     options = options or Options()
+    longest = max(abs(model.span[0]), abs(model.span[1]))
+    patience = min(options.iterations, 60 if longest < _horizon_of(model, _LONG) else _PATIENCE)
     try:
-        best = solve(problem, replace(options, iterations=min(options.iterations, 60)))
+        best = solve(problem, replace(options, iterations=patience))
     except InfeasibleError as error:
         given = model.settings.position is not None or model.settings.tle is not None
         raise GeometryError(
@@ -213,22 +244,18 @@ def solve_from_far(problem: Problem, model: OrbitModel, options: Options | None 
         ) from error
     if best.status is not Status.NOT_CONVERGED and mean_square(best) < _FAR:
         return best
-    radius = float(np.linalg.norm(model.position))
-    horizon = 0.1 * 2 * np.pi * np.sqrt(radius**3 / 3.986004418e14)  # m3/s2 of the Earth
-    longest = max(abs(model.span[0]), abs(model.span[1]))
+    horizon = _horizon_of(model, 0.1)
     values = dict(problem.start)
     while horizon < longest:
-        residuals = []
-        for r in problem.residuals:
-            assert isinstance(r, KernelResidual)
-            keep = np.abs(r.time) <= horizon
-            if keep.any():
-                residuals.append(r.subset(keep))
-        if sum(r.samples * r.kernel.size for r in residuals) >= 6:
-            part = problem.with_residuals(residuals).starting_at(values)
-            values = dict(solve(part, Options(tolerance=1e-3, iterations=25, largest_step=20.0)).values)
+        part = _within(problem, horizon)
+        if sum(r.samples * r.kernel.size for r in part.residuals if isinstance(r, KernelResidual)) >= 6:
+            found = solve(part.starting_at(values), Options(tolerance=1e-3, iterations=25, largest_step=20.0))
+            values = dict(found.values)
+            if horizon > _horizon_of(model, _LONG) and _disturbed(model, found):
+                # What a few revolutions do not fit, more of them will not: something happened to the orbit.
+                return best
         horizon *= 2.5
-    again = solve(problem.starting_at(values), replace(options, iterations=min(options.iterations, 60)))
+    again = solve(problem.starting_at(values), replace(options, iterations=patience))
     return min(best, again, key=lambda e: sum(p.cost for p in e.parts))
 
 
@@ -272,7 +299,7 @@ def solve_tracking(
     estimate = solve_from_far(problem, model, options)
     rejected: dict[str, int] = {}
     for _ in range(4):
-        if not np.isfinite(settings.rejection):
+        if not np.isfinite(settings.rejection) or _disturbed(model, estimate):
             break
         screened, found = without_outliers(problem, estimate, settings.rejection)
         if found == rejected:
@@ -297,8 +324,14 @@ def concluded(model: OrbitModel, estimate: Estimate, rejected: dict[str, int], s
             status = max(status, Status.MODEL_GAP, key=lambda s: s.gravity)
             why.append(shift)
     if status in (Status.MODEL_GAP, Status.NOT_CONVERGED) and status is estimate.status:
-        why += suspicious_stations(model, estimate)
-    if status is Status.MODEL_GAP and energy < 0 and not estimate.problem.effects:
+        suspected = estimate
+        if _disturbed(model, estimate):
+            # Over weeks manoeuvres hide a station at a wrong place; a few revolutions show it, and sooner.
+            early = _within(estimate.problem.starting_at(orbit_problem(model, estimate.problem.effects).start),
+                            _horizon_of(model, _LONG))
+            suspected = solve(early, Options(iterations=_PATIENCE))
+        why += suspicious_stations(model, suspected)
+    if status in (Status.MODEL_GAP, Status.NOT_CONVERGED) and energy < 0 and not estimate.problem.effects:
         axis = -3.986004418e14 / (2 * energy)
         turns = (model.span[1] - model.span[0]) / (2 * np.pi * np.sqrt(axis**3 / 3.986004418e14))
         if turns > 3.0:
