@@ -773,8 +773,8 @@ def _verdict(answer: KeptExplanation, noise: dict[str, float]) -> tuple[str, str
     """The word and its sentence; ``noise`` is that of quiet data by channel."""
     effects, after = answer.effects, answer.after
     manoeuvres = sum(e.name.startswith(FAMILY) for e in effects)
-    others = ", ".join(e.name if len(e.group) == 1 else " or ".join(e.group) for e in effects
-                       if not e.name.startswith(FAMILY))
+    groups = dict.fromkeys(tuple(sorted(e.group)) for e in effects if not e.name.startswith(FAMILY))
+    others = ", ".join(" or ".join(g) for g in groups)
     missing = f"{manoeuvres} manoeuvres" if manoeuvres > 1 else "one manoeuvre"
     missing += f" and {others}" if others else ""
     left = "; ".join(f"{a:.3g} {u} RMS in {c.replace('_', ' ')} ({b:.3g} {u} in data no fit has seen, noise of quiet "
