@@ -183,6 +183,8 @@ def _kernel_cells(residual: KernelResidual, part: Linearization, rows: slice, st
         phase = 2 * (time - start) / max(stop - start, 1e-9) - 1
         smooth = np.linalg.qr(legvander(phase, SMOOTH - 1))[0]
         for component in range(width):
+            if _below(part.whitened[inside, component] / stacked.scale[residual.name]):
+                continue
             columns = np.zeros((rows.stop - rows.start, SMOOTH))
             columns[inside * width + component] = smooth
             basis = stacked.basis[rows]
@@ -195,6 +197,11 @@ def _kernel_cells(residual: KernelResidual, part: Linearization, rows: slice, st
                                int(np.argmax(direct**2)), float(noise[component % len(noise)]),
                                inner=inner, gradient=gradient))
     return cells
+
+
+def _below(whitened: np.ndarray) -> bool:
+    """Whether residuals (n,) stay clearly below the declared noise, structure and all: the model explains them then."""
+    return len(whitened) > 0 and float(np.mean(whitened**2)) < 1 - 2 * float(np.sqrt(2 / len(whitened)))
 
 
 def _square(inner: np.ndarray, gradient: np.ndarray) -> tuple[float, int]:
@@ -222,6 +229,8 @@ def _position_cells(residual: TrajectoryResidual, part: Linearization) -> list[_
         phase = 2 * (time[inside] - start) / max(stop - start, 1e-9) - 1
         smooth = np.linalg.qr(legvander(phase, SMOOTH - 1))[0]
         for axis in range(3):
+            if _below(whitened[inside, axis]):
+                continue
             amounts = smooth.T @ whitened[inside, axis]
             statistic = float(amounts @ amounts)
             cells.append(_Cell("gnss", name, axis, len(inside), start, stop, statistic, SMOOTH,
@@ -265,6 +274,8 @@ def _serial_cells(residual: object, part: Linearization, scale: float) -> list[_
     cells = []
     for component in range(series.shape[1]):
         x = series[:, component]
+        if _below(x):
+            continue
         spread = max(float(np.mean(x**2)), 1.0)  # what stays below the declared noise is no gap, however smooth
         product = float(np.sum(x[1:][pairs] * x[:-1][pairs]))
         z = product / (np.sqrt(count) * spread)
@@ -317,7 +328,9 @@ def _periodic_cells(problem: Problem, parts: Sequence[Linearization], stacked: S
         for i, (_, time, whitened, _) in enumerate(arcs):
             place = np.rint((time - time[0]) / step).astype(int)
             for k in range(components):
-                level = max(float(np.mean(whitened[:, k] ** 2)), 1.0)  # what stays below the declared noise is no gap
+                if _below(whitened[:, k]):
+                    continue
+                level = max(float(np.mean(whitened[:, k] ** 2)), 1.0)
                 spread = np.bincount(place, whitened[:, k], minlength=bins)
                 power[i, k] = 2 * np.abs(np.fft.rfft(spread)[seen]) ** 2 / (len(time) * level)
         samples = sum(len(time) for _, time, _, _ in arcs)
