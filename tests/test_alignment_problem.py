@@ -183,6 +183,15 @@ def test_an_effect_in_the_data_is_noticed_and_estimated():
     assert abs(parameter["value"] - 1.0) < 4 * parameter["sigma"]
 
 
+def test_a_wrong_clock_of_the_receiver_may_move_the_trajectory():
+    """1.5 s are 11 km along the orbit: nothing that the positions alone would ever allow."""
+    campaign, _ = simulate(preset("compact", **SMALL), seed=6, effects={"gnss-timetag-offset": 1.5})
+    closed = solve_campaign(campaign, effects=["gnss-timetag-offset"])
+    (parameter,) = closed.as_dict()["effects"][0]["parameters"].values()
+    assert 1e-3 < parameter["sigma"] < 0.3
+    assert abs(parameter["value"] - 1.5) < 4 * parameter["sigma"]
+
+
 def test_held_out_data_are_left_out():
     campaign, _ = small()
     whole = alignment_model(campaign)

@@ -239,6 +239,37 @@ def test_gap_keeps_its_level_and_finds_what_is_there() -> None:
     assert 0.2 < gap.places[0].excess < 0.5
 
 
+def test_a_period_too_fast_for_smooth_functions_is_found_in_all_arcs_together() -> None:
+    """0.35 of the noise in each of six passes, with a phase of its own: 12 sigma in all, invisible in any one."""
+    draw = np.random.default_rng(17)
+    time = np.linspace(-1, 1, 600)
+    line = (2 + time)[:, None] * np.ones(2)
+    label = np.minimum((6 * np.arange(600)) // 600, 5)
+    phase = draw.uniform(0, 2 * np.pi, 6)[label]
+    measured = line + 0.3 * draw.standard_normal(line.shape)
+    quiet = problem_of(time, measured, 0.3, arcs=6)
+    shaken = measured.copy()
+    shaken[:, 0] += 0.35 * 0.3 * np.sqrt(2) * np.sin(2 * np.pi * time / 0.021 + phase)
+    prepared, rows, parts, _ = fitted(quiet)
+    assert not find_gap(prepared, rows, parts).present
+    prepared, rows, parts, _ = fitted(problem_of(time, shaken, 0.3, arcs=6))
+    gap = find_gap(prepared, rows, parts)
+    (place,) = gap.places
+    assert place.components == (0,)
+    assert place.time_scale == pytest.approx(0.021, rel=0.05) and "repeats every" in place.sentence
+
+
+def test_structure_below_the_declared_noise_is_no_gap() -> None:
+    draw = np.random.default_rng(19)
+    time = np.linspace(-1, 1, 400)
+    line = (2 + time)[:, None] * np.ones(2)
+    measured = line + 0.1 * draw.standard_normal(line.shape) + 0.12 * np.sin(7 * time)[:, None]
+    prepared, rows, parts, _ = fitted(problem_of(time, measured, 0.1))
+    assert find_gap(prepared, rows, parts).present
+    prepared, rows, parts, _ = fitted(problem_of(time, measured, 0.3))  # declared: twice what there is
+    assert not find_gap(prepared, rows, parts).present
+
+
 def test_larger_white_noise_is_not_taken_for_structure() -> None:
     draw = np.random.default_rng(4)
     time = np.sort(draw.uniform(-1, 1, 400))
