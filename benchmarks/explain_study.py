@@ -698,6 +698,8 @@ def page(result: dict[str, Any]) -> str:
             for key, value in values.items():
                 shown = f"{value['count']} of {value['of']}" if isinstance(value, dict) else f"{value:.3g}"
                 lines.append(f"| {rival.replace('_', ' ')} | {key.replace('_', ' ')} | {shown} |")
+    lines += ["", *(f"![Hidden effects of {size}: what was named](../benchmarks/results/explain_confusion_"
+                    f"{size.replace(' ', '_')}.png)" for size in result.get("one", {}))]
     by_effect = {size: one["by_effect"] for size, one in result.get("one", {}).items()}
     if by_effect:
         sizes = list(by_effect)
