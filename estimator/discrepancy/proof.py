@@ -74,8 +74,8 @@ def pays(before: Problem, before_parts: Sequence[Linearization], after: Problem,
 
     With ``d`` the length of the change that the effect makes to the whitened held-out samples, their sum of squares
     drops by ``d^2`` give or take ``2 d`` if the effect is real and its size is known. The fitted sizes err, and with
-    them the states that are carried on to the held-out end of an arc: up to a quarter of ``d^2`` of such error is
-    allowed for, which takes half of the drop. An addition is refused when the sum rises although that is improbable
+    them the states that are carried on to the held-out end of an arc: up to an eighth of ``d^2`` of such error is
+    allowed for, which takes a quarter of the drop. An addition is refused when the sum rises although that is improbable
     (0.1 %) even so.
     """
     drop, change = 0.0, 0.0
@@ -87,7 +87,7 @@ def pays(before: Problem, before_parts: Sequence[Linearization], after: Problem,
         second, _ = _samples(*later[residual.name], True)
         drop += float(np.sum(first**2) - np.sum(second**2))
         change += float(np.sum((first - second) ** 2))
-    return drop > 0 or drop > 0.5 * change - 3.09 * 2 * float(np.sqrt(change))
+    return drop > 0 or drop > 0.75 * change - 3.09 * 2 * float(np.sqrt(change))
 
 
 def channels_of(problem: Problem, name: str) -> tuple[str, ...]:
