@@ -75,8 +75,8 @@ def pays(before: Problem, before_parts: Sequence[Linearization], after: Problem,
     With ``d`` the length of the change that the effect makes to the whitened held-out samples, their sum of squares
     drops by ``d^2`` give or take ``2 d`` if the effect is real and its size is known. The fitted sizes err, and with
     them the states that are carried on to the held-out end of an arc: up to an eighth of ``d^2`` of such error is
-    allowed for, which takes a quarter of the drop. An addition is refused when the sum rises although that is improbable
-    (0.1 %) even so.
+    allowed for, which takes a quarter of the drop. An addition is refused when the sum rises although that is
+    improbable (0.1 %) even so.
     """
     drop, change = 0.0, 0.0
     later = {r.name: (r, p) for r, p in zip(after.residuals, after_parts, strict=True)}
