@@ -195,13 +195,7 @@ def measured(
                 np.array([*answer["position"], *answer["velocity"]]),
                 float(np.linalg.norm(answer["constant_acceleration"])),
             ),
-            "range_m": float(gaps["range"].std()),
-            "azimuth_deg": float(np.degrees(gaps["azimuth_elevation"][:, 0].std())),
-            "elevation_deg": float(np.degrees(gaps["azimuth_elevation"][:, 1].std())),
-            "ranges": len(gaps["range"]),
-            "angles": len(gaps["azimuth_elevation"]),
-            "unknowns": answer["unknowns"],
-            "iterations": answer["iterations"],
+            **_of_rival(answer, gaps),
             "evaluations": answer["evaluations"],
             "gravity": answer["gravity"],
             "seconds_first": first["orekit_seconds"],
@@ -214,6 +208,20 @@ def measured(
     return result
 
 
+def _of_rival(answer: dict[str, Any], gaps: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Residuals (m and degrees), their number and the size of a rival's fit."""
+    angles = gaps["azimuth_elevation"]
+    return {
+        "range_m": float(gaps["range"].std()),
+        "azimuth_deg": float(np.degrees(angles[:, 0].std())),
+        "elevation_deg": float(np.degrees(angles[:, 1].std())),
+        "ranges": len(gaps["range"]),
+        "angles": len(angles),
+        "unknowns": answer["unknowns"],
+        "iterations": answer["iterations"],
+    }
+
+
 def by_brahe(folder: Path) -> dict[str, Any]:
     """One solution by brahe's batch estimator; nothing in it gets faster by repeating."""
     from benchmarks.orbit_w3b_brahe import solved
@@ -222,13 +230,7 @@ def by_brahe(folder: Path) -> dict[str, Any]:
     gaps = answer["residuals"]
     return {
         **accuracy(answer["state"], float(np.linalg.norm(answer["constant_acceleration"]))),
-        "range_m": float(gaps["range"].std()),
-        "azimuth_deg": float(np.degrees(gaps["azimuth_elevation"][:, 0].std())),
-        "elevation_deg": float(np.degrees(gaps["azimuth_elevation"][:, 1].std())),
-        "ranges": len(gaps["range"]),
-        "angles": len(gaps["azimuth_elevation"]),
-        "unknowns": answer["unknowns"],
-        "iterations": answer["iterations"],
+        **_of_rival(answer, gaps),
         "converged": answer["converged"],
         "seconds_first": answer["seconds"],
         "seconds": _spread([answer["seconds"]]),
