@@ -5,8 +5,12 @@ channel's unit) from the unknowns (ambient coordinates), signals, data and noise
 differentiated once and then mapped, and its Jacobian is chained with the signals' outside.
 
 Noise inputs stand for measured quantities that enter the prediction (the attitude of an epoch inside a Doppler
-residual). They are nuisance unknowns, one set per sample, and are eliminated exactly: minimizing over a Gaussian
-noise input of covariance P is the same as whitening with ``R + H P H'``, H being the kernel's Jacobian along it.
+residual). They are nuisance unknowns, one set per sample, and are eliminated: minimizing over a Gaussian noise input
+``e`` of covariance P is, around any ``e0``, the same as whitening ``r(e0) - H e0`` with ``R + H P H'``, H being the
+kernel's Jacobian along it at ``e0``. With ``e0`` at the minimum the elimination is exact: cost and gradient are those
+of the joint problem in which every ``e`` is an unknown. Taken at ``e0 = 0`` instead, measurement noise would enter the
+Jacobians and correlate with the residuals, which biases what is estimated (Boggs, Byrd, Schnabel 1987, A stable and
+efficient algorithm for nonlinear orthogonal distance regression).
 """
 
 from __future__ import annotations
@@ -22,6 +26,10 @@ from estimator.losses import Loss, Quadratic
 from estimator.models.compiled import Mapped, compiled
 from estimator.signals import Signal, Values
 from estimator.unknowns import Manifold, Unknown
+
+NOISE_ITERATIONS = 5  # re-estimates of the noise inputs; each gains the digits of a Newton step
+NOISE_TOLERANCE = 1e-7  # sigma: change of a noise input below which its estimate stands
+LARGEST_NOISE = 6.0  # sigma: an outlier must not turn the point of linearization without bound
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +88,7 @@ class Kernel:
         unknowns: unknowns that enter directly, each an input of its name.
         signals: (name, manifold) of the signals that enter.
         data: (name, size) of per-sample data; (name, (rows, columns)) for matrices.
-        noise: (name, size) of noise inputs, all zero at the sample.
+        noise: (name, size) of noise inputs; zero where a call does not give them.
         build: from a dict of input name to SX symbol to the residual (m) as SX.
     """
 
@@ -100,10 +108,10 @@ class Kernel:
             inputs[label] = seen[label] = ca.SX.sym("u", *(size if isinstance(size, tuple) else (size, 1)))
         zeros = [step for _, step in steps]
         for label, size in noise:
-            symbol = ca.SX.sym("e", size)
-            seen[label] = symbol
-            steps.append((label, symbol))
-            zeros.append(symbol)
+            inputs[label], step = ca.SX.sym("e", size), ca.SX.sym("d", size)
+            seen[label] = inputs[label] + step
+            steps.append((label, step))
+            zeros.append(step)
         residual = ca.densify(ca.SX(build(seen)))  # type: ignore[operator]
         self.size = residual.shape[0]
         stacked = ca.vertcat(*zeros)
@@ -122,16 +130,14 @@ class Kernel:
 
     def __call__(self, samples: int, inputs: Mapping[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Residual (n, m) and the Jacobian (n, m, tangent) along each unknown, signal and noise input."""
-        named = {f"i{j}": inputs[label] for j, label in enumerate(self.labels)}
+        absent = {label: np.zeros((samples, size)) for label, size in self.noise if label not in inputs}
+        given = {**inputs, **absent}
+        named = {f"i{j}": given[label] for j, label in enumerate(self.labels)}
         residual, *jacobians = self.mapped(samples, **named)
         shaped = {}
         for label, jacobian in zip(self.steps, jacobians, strict=True):
             shaped[label] = jacobian if jacobian.ndim == 3 else jacobian[:, :, None]
         return residual, shaped
-
-    def symbolic(self, inputs: Mapping[str, ca.MX]) -> ca.MX:
-        """Residual (m, n) of mapped inputs, for solvers that differentiate by themselves."""
-        return self.expression.call([inputs[label] for label in self.labels])[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,6 +158,9 @@ class KernelResidual:
         loss: robust loss.
         accepted: (n,) False for rejected samples, which keep their place and lose their weight.
         factor: (n, m, m) inverse symmetric root of the covariance, or None before :meth:`prepared`.
+        estimated: (n, size) estimate of each noise input, around which the kernel is linearized; empty before
+            :meth:`prepared`.
+        offset: (n, m) part of the residual that the estimates explain, in ``unit``.
     """
 
     name: str
@@ -168,6 +177,8 @@ class KernelResidual:
     loss: Loss = field(default_factory=Quadratic)
     accepted: np.ndarray | None = None
     factor: np.ndarray | None = None
+    estimated: Mapping[str, np.ndarray] = field(default_factory=dict)
+    offset: np.ndarray | None = None
 
     @property
     def samples(self) -> int:
@@ -178,39 +189,62 @@ class KernelResidual:
         ordered = dict.fromkeys([*self.kernel.unknowns, *(u for s in self.signals for u in s.unknowns)])
         return tuple(ordered)
 
-    def _evaluate(self, values: Values) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray]]:
-        inputs: dict[str, np.ndarray] = dict(self.data)
+    def _inputs(self, values: Values) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+        """Inputs of the kernel, and the Jacobian of each signal."""
+        inputs: dict[str, np.ndarray] = {**self.data, **self.estimated}
         inputs.update({u.name: values[u.name] for u in self.kernel.unknowns})
         signal_jacobians = {}
         for signal in self.signals:
             inputs[signal.name], signal_jacobians[signal.name] = signal.evaluate(values)
-        residual, jacobians = self.kernel(self.samples, inputs)
-        return residual, jacobians, signal_jacobians
+        return inputs, signal_jacobians
 
-    def _whitening(self, jacobians: Mapping[str, np.ndarray]) -> np.ndarray:
+    def _covariance(self, jacobians: Mapping[str, np.ndarray]) -> np.ndarray:
         n, m = self.standard_deviation.shape
-        if not self.noise:
-            factor = np.zeros((n, m, m))
-            factor[:, range(m), range(m)] = 1.0 / self.standard_deviation
-            return factor
         covariance = np.zeros((n, m, m))
         covariance[:, range(m), range(m)] = self.standard_deviation**2
         for label, sigma in self.noise.items():
             spread = jacobians[label] * sigma[:, None, :]
             covariance += spread @ spread.transpose(0, 2, 1)
+        return covariance
+
+    def prepared(self, values: Values) -> KernelResidual:
+        """The residual with the noise inputs estimated and the whitening taken at ``values``."""
+        if not self.noise:
+            if self.factor is not None:
+                return self
+            n, m = self.standard_deviation.shape
+            factor = np.zeros((n, m, m))
+            factor[:, range(m), range(m)] = 1.0 / self.standard_deviation
+            return replace(self, factor=factor)
+        inputs, _ = self._inputs(values)
+        estimated = {label: self.estimated.get(label, np.zeros_like(sigma)) for label, sigma in self.noise.items()}
+        for iteration in range(NOISE_ITERATIONS):
+            residual, jacobians = self.kernel(self.samples, {**inputs, **estimated})
+            covariance = self._covariance(jacobians)
+            offset = sum(np.einsum("nij,nj->ni", jacobians[label], e) for label, e in estimated.items())
+            weighted = np.linalg.solve(covariance, (residual - offset)[:, :, None])[:, :, 0]
+            found = {label: np.clip(-(sigma**2) * np.einsum("nij,ni->nj", jacobians[label], weighted),
+                                    -LARGEST_NOISE * sigma, LARGEST_NOISE * sigma)
+                     for label, sigma in self.noise.items()}
+            change = max(float(np.max(np.abs(found[label] - estimated[label]) / sigma, initial=0.0))
+                         for label, sigma in self.noise.items())
+            if change < NOISE_TOLERANCE or iteration == NOISE_ITERATIONS - 1:
+                break
+            estimated = found
         # The symmetric root keeps each component of the whitened residual closest to the component it came from, so
         # that structure in one beam shows in that beam.
         eigenvalues, vectors = np.linalg.eigh(covariance)
-        return (vectors / np.sqrt(eigenvalues)[:, None, :]) @ vectors.transpose(0, 2, 1)
-
-    def prepared(self, values: Values) -> KernelResidual:
-        if not self.noise:
-            return self if self.factor is not None else replace(self, factor=self._whitening({}))
-        return replace(self, factor=self._whitening(self._evaluate(values)[1]))
+        factor = (vectors / np.sqrt(eigenvalues)[:, None, :]) @ vectors.transpose(0, 2, 1)
+        return replace(self, factor=factor, estimated=estimated, offset=np.asarray(offset))
 
     def linearize(self, values: Values, only: Collection[str] | None = None) -> Linearization:
-        residual, jacobians, signal_jacobians = self._evaluate(values)
-        factor = self.factor if self.factor is not None else self._whitening(jacobians)
+        if self.factor is None:
+            return self.prepared(values).linearize(values, only)
+        factor = self.factor
+        inputs, signal_jacobians = self._inputs(values)
+        residual, jacobians = self.kernel(self.samples, inputs)
+        if self.offset is not None:
+            residual = residual - self.offset
         columns = tuple(u for u in self.unknowns if only is None or u.name in only)
         width = {u.name: u.manifold.tangent for u in columns}
         starts = dict(zip(width, np.concatenate([[0], np.cumsum(list(width.values()))[:-1]]).astype(int), strict=True))
@@ -256,9 +290,10 @@ class KernelResidual:
     def symbolic(self, values: Mapping[str, ca.MX]) -> ca.MX:
         n, m = self.samples, self.kernel.size
         inputs: dict[str, ca.MX] = {}
+        known = {**self.data, **self.estimated}
         for label in self.kernel.labels:
-            if label in self.data:
-                array = np.asarray(self.data[label], dtype=float)
+            if label in known:
+                array = np.asarray(known[label], dtype=float)
                 flat = array.reshape(n, -1) if array.ndim < 3 else None
                 stacked = flat.T if flat is not None else np.concatenate(list(array), axis=1)
                 inputs[label] = ca.MX(ca.DM(stacked))
@@ -266,9 +301,11 @@ class KernelResidual:
             inputs[unknown.name] = ca.repmat(values[unknown.name], 1, n)
         for signal in self.signals:
             inputs[signal.name] = signal.symbolic(values)
-        raw = self.kernel.expression.map(n).call([inputs[label] for label in self.kernel.labels])[0]
         if self.factor is None:
             raise ValueError("prepare the residual before asking for its symbolic form")
+        raw = self.kernel.expression.map(n).call([inputs[label] for label in self.kernel.labels])[0]
+        if self.offset is not None:
+            raw -= ca.MX(ca.DM(self.offset.T))
         rows = [ca.sum1(ca.DM(self.factor[:, i, :].T) * raw) for i in range(m)]
         return ca.vec(ca.vertcat(*rows))
 
@@ -284,6 +321,8 @@ class KernelResidual:
             arc=self.arc[keep],
             accepted=None if self.accepted is None else self.accepted[keep],
             factor=None if self.factor is None else self.factor[keep],
+            estimated={k: v[keep] for k, v in self.estimated.items()},
+            offset=None if self.offset is None else self.offset[keep],
         )
 
     def with_data(self, **data: np.ndarray) -> KernelResidual:

@@ -64,7 +64,8 @@ def _epoch_information(beams: int) -> ca.Function:
     directions, carrier = ca.SX.sym("beams", beams, 3), ca.SX.sym("carrier")
     doppler_sigma, tracker_sigma = ca.SX.sym("doppler_sigma", beams), ca.SX.sym("tracker_sigma", 3)
     inputs = {"antenna_from_tracker": mounting, "velocity": velocity, "attitude": attitude, "earth_angle": ca.SX(0),
-              "beam_direction": directions, "shift": ca.SX.zeros(beams), "carrier": carrier}
+              "beam_direction": directions, "shift": ca.SX.zeros(beams), "carrier": carrier,
+              "attitude_error": ca.SX.zeros(3)}
     outputs = kernel.expression.call([inputs[label] for label in kernel.labels])
     slopes = dict(zip(kernel.steps, outputs[1:], strict=True))
     along = slopes["antenna_from_tracker"] / ca.repmat(doppler_sigma, 1, 3)
