@@ -205,6 +205,17 @@ def test_held_out_data_are_left_out():
         alignment_model(campaign, hold_out=0.95)
 
 
+def test_environment_of_the_same_times_is_looked_up_once():
+    campaign, _ = small()
+    model = alignment_model(campaign)
+    time = np.linspace(10.0, 400.0, 40)
+    table = model.environment(time)
+    assert model.environment(time.copy()) is table
+    assert not table.flags.writeable
+    np.testing.assert_array_equal(model.environment(time[::2]).shape, (20, table.shape[1]))
+    np.testing.assert_array_equal(alignment_model(campaign).environment(time), table)
+
+
 def test_nodes_hold_every_sample_and_switch():
     rng = np.random.default_rng(0)
     samples = np.sort(rng.uniform(3.0, 40.0, 50))

@@ -10,7 +10,7 @@ the star tracker along every rotation arc. What a campaign cannot determine is l
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -82,6 +82,7 @@ class AlignmentModel:
     hold_out: float = 0.0
     given_frame: FourierFrame | StretchedFrame | None = None
     dropped_positions: int = 0
+    _tables: dict[bytes, np.ndarray] = field(default_factory=dict, repr=False)
 
     @cached_property
     def stretches(self) -> tuple[slice, ...]:
@@ -328,12 +329,22 @@ class AlignmentModel:
         return quaternion
 
     def environment(self, time: np.ndarray) -> np.ndarray:
-        """Table (n, rows) of everything about the environment that an effect may depend on, along the orbit."""
+        """Table (n, rows) of everything about the environment that an effect may depend on, along the orbit.
+
+        Kept, and not to be written to: problems with other effects ask for the same times again and again.
+        """
+        time = np.asarray(time, dtype=float)
+        key = time.tobytes()
+        if key not in self._tables:
+            self._tables[key] = self._environment(time)
+            self._tables[key].flags.writeable = False
+        return self._tables[key]
+
+    def _environment(self, time: np.ndarray) -> np.ndarray:
         from scipy.spatial.transform import Rotation
 
         from estimator.models.environment import environment_table
 
-        time = np.asarray(time, dtype=float)
         angle = self.earth_angle(time)
         inertial_from_fixed = Rotation.from_rotvec(np.column_stack([0 * angle, 0 * angle, angle]))
         fixed = self.position(time)
