@@ -17,6 +17,7 @@ from estimator.discrepancy.score import (
     Signature,
     Stack,
     log_evidence,
+    orthonormalized,
     scored,
     settings,
     signature,
@@ -42,8 +43,7 @@ def ordinary(count: int, scale: float = 1.0) -> EffectInstance:
 
 def stack_of(jacobian: np.ndarray, residual: np.ndarray) -> Stack:
     unknown = Unknown("calibration", Vector(jacobian.shape[1]), "1", 1.0)
-    return Stack(residual, np.linalg.qr(jacobian)[0], jacobian, (unknown,), {"all": slice(0, len(residual))},
-                 {"all": 1.0})
+    return orthonormalized(residual, {"all": (np.arange(jacobian.shape[1]), jacobian)}, (unknown,), {"all": 1.0})
 
 
 def candidate(declared: EffectInstance, columns: np.ndarray) -> Signature:
@@ -56,6 +56,34 @@ def square_after(jacobian: np.ndarray, residual: np.ndarray) -> float:
 
 
 # ---------------------------------------------------------------------------------------------------- scores
+
+
+def test_stack_by_residuals_is_that_of_the_whole_jacobian() -> None:
+    """Residuals that feel different unknowns, one of them more columns than it has rows, one direction unseen."""
+    draw = np.random.default_rng(11)
+    felt = {"a": np.arange(6), "b": np.array([0, 6, 7]), "c": np.array([1, 2, 6, 8])}
+    rows = {"a": 4, "b": 50, "c": 30}
+    jacobians = {name: (index, draw.standard_normal((rows[name], len(index)))) for name, index in felt.items()}
+    jacobians["c"][1][:, 3] = jacobians["c"][1][:, 2]  # nothing but c feels column 8, and b tells 6 from it
+    jacobians["b"][1][:, 1] = 0.0  # but b does not
+    whole = np.zeros((84, 9))
+    start = 0
+    for index, block in jacobians.values():
+        whole[start : start + len(block), index] = block
+        start += len(block)
+    residual, columns = draw.standard_normal(84), draw.standard_normal((84, 3))
+    unknown = Unknown("calibration", Vector(9), "1", 1.0)
+    made = orthonormalized(residual, jacobians, (unknown,), dict.fromkeys(felt, 1.0))
+    assert made.blocks == {"a": slice(0, 4), "b": slice(4, 54), "c": slice(54, 84)}
+    rank = np.linalg.matrix_rank(whole)
+    assert rank == 8 and made.basis.shape == (84, rank)
+    np.testing.assert_allclose(made.basis.T @ made.basis, np.eye(rank), atol=1e-13)
+    np.testing.assert_allclose(made.jacobian, whole)
+    np.testing.assert_allclose(made.gram, whole.T @ whole, atol=1e-12)
+    np.testing.assert_allclose(made.along(columns), whole.T @ columns, atol=1e-12)
+    np.testing.assert_allclose(made.carried(columns), made.basis.T @ columns, atol=1e-12)
+    left = columns - whole @ np.linalg.lstsq(whole, columns, rcond=1e-12)[0]
+    np.testing.assert_allclose(made.projected(columns), left, atol=1e-12)
 
 
 @pytest.mark.parametrize("columns", [1, 3, 6])

@@ -136,7 +136,7 @@ class _Bench:
                 self.jacobian.append(whole[a.samples[:, None] * width + np.arange(width)])
             else:
                 self.jacobian.append(np.zeros((len(a.samples), width, 0)))
-        gram = stacked.jacobian.T @ stacked.jacobian
+        gram = stacked.gram
         self.inverse = np.linalg.pinv(gram, rcond=1e-13, hermitian=True) if len(gram) else gram
 
     def fit(self, form: _Form) -> _Fit:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.polynomial.legendre import legvander
 from scipy.stats import chi2, norm
 
-from estimator.discrepancy.score import Stack
+from estimator.discrepancy.score import Piece, Stack
 from estimator.problem import Problem
 from estimator.residuals import KernelResidual, Linearization
 from estimator.trajectory_residual import TrajectoryResidual
@@ -110,10 +110,10 @@ def find_gap(problem: Problem, stacked: Stack, parts: Sequence[Linearization]) -
         parts: its linearizations at the fit.
     """
     cells: list[_Cell] = []
+    absorbed = stacked.carried(stacked.residual)
     for residual, part in zip(problem.residuals, parts, strict=True):
-        rows = stacked.blocks[residual.name]
         if isinstance(residual, KernelResidual):
-            cells += _kernel_cells(residual, part, rows, stacked)
+            cells += _kernel_cells(residual, part, stacked, absorbed)
         elif isinstance(residual, TrajectoryResidual):
             cells += _position_cells(residual, part)
         cells += _serial_cells(residual, part, stacked.scale[residual.name])
@@ -125,7 +125,7 @@ def find_gap(problem: Problem, stacked: Stack, parts: Sequence[Linearization]) -
     structured = {c.channel for c in significant}
     white = {name: s for name, s in stacked.scale.items() if s > 1}
     for residual, part in zip(problem.residuals, parts, strict=True):
-        excess = _noise_excess(part, stacked, stacked.blocks[residual.name], len(problem.residuals))
+        excess = _noise_excess(part, stacked.pieces[residual.name], len(problem.residuals))
         if excess > 1 and residual.channel not in structured:
             white[residual.name] = max(white.get(residual.name, 1.0), excess)
     places = []
@@ -169,8 +169,11 @@ def _sum(cells: Sequence[_Cell]) -> tuple[float, int]:
     return statistic, max(degrees, 1)
 
 
-def _kernel_cells(residual: KernelResidual, part: Linearization, rows: slice, stacked: Stack) -> list[_Cell]:
+def _kernel_cells(residual: KernelResidual, part: Linearization, stacked: Stack,
+                  absorbed: np.ndarray) -> list[_Cell]:
+    """Smooth functions in every arc and component; ``absorbed`` are the products of the basis with the residual."""
     cells = []
+    piece = stacked.pieces[residual.name]
     width = part.whitened.shape[1]
     kept = part.weight > 0
     noise = np.sqrt(np.mean(residual.standard_deviation**2, axis=0))
@@ -185,12 +188,10 @@ def _kernel_cells(residual: KernelResidual, part: Linearization, rows: slice, st
         for component in range(width):
             if _below(part.whitened[inside, component] / stacked.scale[residual.name]):
                 continue
-            columns = np.zeros((rows.stop - rows.start, SMOOTH))
-            columns[inside * width + component] = smooth
-            basis = stacked.basis[rows]
-            inner = basis.T @ columns
-            direct = columns.T @ stacked.residual[rows]
-            gradient = direct - inner.T @ (stacked.basis.T @ stacked.residual)
+            at = inside * width + component
+            inner = piece.inner.T @ (piece.span[at].T @ smooth)
+            direct = smooth.T @ stacked.residual[piece.rows][at]
+            gradient = direct - inner.T @ absorbed
             statistic, degrees = _square(inner, gradient)
             cells.append(_Cell(residual.channel, name, component, len(inside), start, stop, statistic, degrees,
                                float(chi2.sf(statistic, max(degrees, 1))), float(direct @ direct),
@@ -239,10 +240,10 @@ def _position_cells(residual: TrajectoryResidual, part: Linearization) -> list[_
     return cells
 
 
-def _noise_excess(part: Linearization, stacked: Stack, rows: slice, residuals: int) -> float:
+def _noise_excess(part: Linearization, piece: Piece, residuals: int) -> float:
     """Root mean square of the whitened residual where its sum of squares is improbably large, 1 else."""
     total = float(np.sum(part.weight[:, None] * part.whitened**2))
-    degrees = part.measurements - float(np.sum(stacked.basis[rows] ** 2))
+    degrees = part.measurements - float(np.sum(piece.inner**2))  # its share of the fit's directions
     if degrees < 1 or chi2.sf(total, degrees) * residuals > LEVEL:
         return 1.0
     return float(np.sqrt(total / degrees))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.stats import chi2
@@ -74,27 +75,117 @@ class Score:
 
 
 @dataclass(frozen=True, eq=False)
+class Piece:
+    """The rows of one residual in a stack.
+
+    Attributes:
+        rows: where they are.
+        felt: (f,) columns of the fit's Jacobian that these rows can feel; all others are zero here.
+        jacobian: (n, f) those columns, scaled.
+        span: (n, g) orthonormal columns of the same span.
+        inner: (g, p) ``span @ inner`` are the rows of the stack's basis.
+    """
+
+    rows: slice
+    felt: np.ndarray
+    jacobian: np.ndarray
+    span: np.ndarray
+    inner: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class Stack:
     """All whitened rows of a problem at one point, with the fit's columns orthonormalized.
 
+    An arc feels a dozen of the fit's hundreds of columns, so everything goes residual by residual.
+
     Attributes:
         residual: (rows,).
-        basis: (rows, p) orthonormal columns spanning the fit's Jacobian.
-        jacobian: (rows, p) the fit's Jacobian, scaled.
-        blocks: rows of each residual by name.
+        pieces: the rows of each residual by name.
+        columns: the unknowns of the fit.
         scale: factor by which each residual's noise exceeds the declared one (by name).
     """
 
     residual: np.ndarray
-    basis: np.ndarray
-    jacobian: np.ndarray
+    pieces: Mapping[str, Piece]
     columns: tuple[Unknown, ...]
-    blocks: Mapping[str, slice]
     scale: Mapping[str, float]
 
+    @cached_property
+    def blocks(self) -> Mapping[str, slice]:
+        """Rows of each residual by name."""
+        return {name: piece.rows for name, piece in self.pieces.items()}
+
+    @cached_property
+    def basis(self) -> np.ndarray:
+        """(rows, p) orthonormal columns spanning the fit's Jacobian."""
+        return np.concatenate([p.span @ p.inner for p in self.pieces.values()])
+
+    @cached_property
+    def jacobian(self) -> np.ndarray:
+        """(rows, p) the fit's Jacobian, scaled."""
+        result = np.zeros((len(self.residual), sum(u.manifold.tangent for u in self.columns)))
+        for piece in self.pieces.values():
+            result[piece.rows, piece.felt] = piece.jacobian
+        return result
+
+    @cached_property
+    def gram(self) -> np.ndarray:
+        """(p, p) the Jacobian's product with itself."""
+        size = sum(u.manifold.tangent for u in self.columns)
+        result = np.zeros((size, size))
+        for piece in self.pieces.values():
+            result[np.ix_(piece.felt, piece.felt)] += piece.jacobian.T @ piece.jacobian
+        return result
+
+    def along(self, columns: np.ndarray) -> np.ndarray:
+        """Products (p, k) of the fit's Jacobian with ``columns`` (rows, k)."""
+        result = np.zeros((sum(u.manifold.tangent for u in self.columns), columns.shape[1]))
+        for piece in self.pieces.values():
+            result[piece.felt] += piece.jacobian.T @ columns[piece.rows]
+        return result
+
+    def carried(self, columns: np.ndarray) -> np.ndarray:
+        """Products of the basis with ``columns`` (rows, ...)."""
+        return np.asarray(sum(p.inner.T @ (p.span.T @ columns[p.rows]) for p in self.pieces.values()))
+
     def projected(self, columns: np.ndarray) -> np.ndarray:
-        """The part of ``columns`` (rows, k) that the fit does not absorb."""
-        return columns - self.basis @ (self.basis.T @ columns)
+        """The part of ``columns`` (rows, ...) that the fit does not absorb."""
+        carried = self.carried(columns)
+        result = np.empty_like(columns)
+        for p in self.pieces.values():
+            result[p.rows] = columns[p.rows] - p.span @ (p.inner @ carried)
+        return result
+
+
+def orthonormalized(residual: np.ndarray, jacobians: Mapping[str, tuple[np.ndarray, np.ndarray]],
+                    columns: tuple[Unknown, ...], scale: Mapping[str, float]) -> Stack:
+    """The stack of residuals with the fit's columns made orthonormal, directions that the data do not see left out.
+
+    Args:
+        residual: (rows,) of all residuals, one after the other.
+        jacobians: of each residual by name, the columns (f,) that it feels and its scaled Jacobian (n, f) along them.
+        columns: the unknowns of the fit.
+        scale: see :class:`Stack`.
+    """
+    total = sum(u.manifold.tangent for u in columns)
+    spans, triangles = [], []
+    for felt, jacobian in jacobians.values():
+        span, triangle = np.linalg.qr(jacobian)
+        wide = np.zeros((len(triangle), total))
+        wide[:, felt] = triangle
+        spans.append(span)
+        triangles.append(wide)
+    # The triangles stand for the rows: a few hundred of them instead of tens of thousands.
+    left, singular, _ = np.linalg.svd(np.concatenate(triangles), full_matrices=False)
+    kept = singular**2 > max(1e-14 * float(np.max(singular, initial=0.0)) ** 2, 1e-12)
+    pieces, start, row = {}, 0, 0
+    for (name, (felt, jacobian)), span in zip(jacobians.items(), spans, strict=True):
+        inner = left[row : row + span.shape[1], kept]
+        row += span.shape[1]
+        pieces[name] = Piece(slice(start, start + len(jacobian)), felt, jacobian, span, inner)
+        start += len(jacobian)
+    return Stack(residual, pieces, columns, scale)
 
 
 def rows_of(part: Linearization, unknowns: Sequence[Unknown], scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
@@ -131,24 +222,20 @@ def stack(problem: Problem, parts: Sequence[Linearization]) -> Stack:
     a declared noise is not taken for an effect.
     """
     unknowns = problem.free
-    residuals, jacobians, blocks, scales, start = [], [], {}, {}, 0
+    places = offsets(unknowns)
+    residuals, jacobians, scales = [], {}, {}
     for residual, part in zip(problem.residuals, parts, strict=True):
         noise = white_noise_scale(part)
         count = max(int(np.sum(part.weight > 0)) * part.whitened.shape[1], 1)
-        scales[residual.name] = noise if noise > 1 + 6 / np.sqrt(count) else 1.0
-        r, j = rows_of(part, unknowns, scales[residual.name])
-        blocks[residual.name] = slice(start, start + len(r))
-        start += len(r)
+        scale = noise if noise > 1 + 6 / np.sqrt(count) and unknowns else 1.0
+        felt = tuple(u for u in unknowns if any(c.name == u.name for c in part.columns))
+        r, j = rows_of(part, felt, scale)
+        index = np.concatenate([np.zeros(0, dtype=int), *(np.arange(places[u.name].start, places[u.name].stop)
+                                                          for u in felt)])
         residuals.append(r)
-        jacobians.append(j)
-    jacobian = np.concatenate(jacobians)
-    if jacobian.shape[1] == 0:
-        return Stack(np.concatenate(residuals), jacobian, jacobian, unknowns, blocks, dict.fromkeys(scales, 1.0))
-    gram = jacobian.T @ jacobian
-    eigenvalues, vectors = np.linalg.eigh(gram)
-    kept = eigenvalues > max(1e-14 * eigenvalues[-1], 1e-12)
-    basis = jacobian @ (vectors[:, kept] / np.sqrt(eigenvalues[kept]))
-    return Stack(np.concatenate(residuals), basis, jacobian, unknowns, blocks, scales)
+        jacobians[residual.name] = index, j
+        scales[residual.name] = scale
+    return orthonormalized(np.concatenate(residuals), jacobians, unknowns, scales)
 
 
 def signature(stacked: Stack, problem: Problem, parts: Sequence[Linearization], effect: EffectInstance,
@@ -171,7 +258,7 @@ def signature(stacked: Stack, problem: Problem, parts: Sequence[Linearization], 
         if all(u.name != effect.name for u in residual.unknowns) or residual.name not in stacked.blocks:
             continue
         rows = stacked.blocks[residual.name]
-        _, block = rows_of(part, (unknown,), stacked.scale[residual.name] if stacked.jacobian.size else 1.0)
+        _, block = rows_of(part, (unknown,), stacked.scale[residual.name])
         if rows.stop - rows.start == len(block):
             columns[rows] = block * typical
     return Signature(effect, setting, ordinary, columns[:, ordinary], stacked.blocks)
@@ -261,10 +348,10 @@ def _noncentral(threshold: float, degrees: int, shift: float) -> float:
 
 def _absorbers(stacked: Stack, columns: np.ndarray) -> tuple[str, ...]:
     """Unknowns of the fit whose movement imitates the signature most, largest first."""
-    gram = stacked.jacobian.T @ stacked.jacobian
+    gram = stacked.gram
     regular = gram + 1e-12 * np.trace(gram) / len(gram) * np.eye(len(gram))
-    solution = np.linalg.solve(regular, stacked.jacobian.T @ columns)
-    moved = {u.name: float(np.linalg.norm(stacked.jacobian[:, c] @ solution[c]))
+    solution = np.linalg.solve(regular, stacked.along(columns))
+    moved = {u.name: float(np.sqrt(max(np.sum(solution[c] * (gram[c, c] @ solution[c])), 0.0)))
              for u, c in zip(stacked.columns, offsets(stacked.columns).values(), strict=True)}
     largest = max(moved.values(), default=0.0)
     return tuple(k for k, v in sorted(moved.items(), key=lambda item: -item[1]) if v > 0.1 * largest)[:4]
