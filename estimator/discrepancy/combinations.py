@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -27,6 +28,7 @@ is there at all is for its significance after the search to say; the price only 
 PER_NAME = 2.0
 COLLINEAR = 1e-7  # relative eigenvalue below which directions of a set are one
 MARGIN = 4.0  # sigma beyond the plausible range that a size may have, a quarter of half the range at most
+PAIRED = 16  # strongest names beside a set that are tried two at a time
 CURVED = 0.1  # part of a size that the linear model may be wrong by
 
 
@@ -204,7 +206,8 @@ class LinearLibrary:
              refused: Collection[frozenset[str]] = ()) -> list[int]:
         """The set of at most ``most`` candidates of the highest worth that steps from ``start`` and from nothing reach.
 
-        A step adds a name, takes one away or exchanges one.
+        A step adds a name, takes one away or exchanges one; where no such step is worth it, one name (or none) makes
+        place for two: a rich name imitates two simple ones that only together are worth more.
 
         Args:
             start: indices of a set to begin with.
@@ -292,4 +295,14 @@ class LinearLibrary:
                 setting = self.best_setting(kept, name)
                 if setting is not None:
                     look([*kept, setting])
+        if best is not None:
+            return best, best_worth
+        for kept in kept_sets:
+            if len(kept) + 2 > most:
+                continue
+            alone = {name: i for name in names if name not in present
+                     and (i := self.best_setting(kept, name)) is not None}
+            strongest = sorted(alone.values(), key=lambda i: -self.explained((*kept, i)).drop)[:PAIRED]
+            for a, b in combinations(strongest, 2):
+                look([*kept, a, b])
         return None if best is None else (best, best_worth)

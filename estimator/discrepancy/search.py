@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
 from estimator.discrepancy.combinations import Candidate, LinearLibrary, price, visible_directions
@@ -508,21 +509,45 @@ class Workflow:
                     best, worth = refit.effects, self.worth(refit)
         return best
 
-    def group(self, effects: tuple[str, ...], name: str, excluded: Collection[str] = ()) -> tuple[str, ...]:
-        """Names that explain the data as well as ``name`` beside the other effects.
+    def groups(self, effects: tuple[str, ...], excluded: Collection[str] = ()) -> dict[str, tuple[str, ...]]:
+        """For each of the effects the names that explain the data as well in its place, its own first.
 
-        A richer name can copy a simpler one: it must come closer in worth to be held for as likely.
+        A richer name can copy a simpler one: it must come closer in worth to be held for as likely. Where a set that
+        is worth as much differs in more than one name, each new name goes to the place of the one that it copies best.
         """
         full = self.fit(effects)
         worth = self.worth(full)
-        degrees = self._degrees.get(name, 1)
-        without = self.fit([n for n in effects if n != name], full)
-        alike = [name]
-        for other, refit in self.rivals(effects, name, excluded):
-            room = INDISTINGUISHABLE / (1 if self._degrees.get(other, 1) <= degrees else 2)
-            if self.worth(refit) > worth - room and self.significant(without.cost - refit.cost, other) < SIGNIFICANT:
-                alike.append(other)
-        return tuple(alike)
+        alike = {name: [name] for name in effects}
+        for name in effects:
+            without = self.fit([n for n in effects if n != name], full)
+            for other, refit in self.rivals(effects, name, excluded):
+                room = INDISTINGUISHABLE / (1 if self._freedom(refit.effects) <= self._freedom(effects) else 2)
+                if self.worth(refit) <= worth - room or \
+                        self.significant(without.cost - refit.cost, other) >= SIGNIFICANT:
+                    continue
+                for place, newcomer in self._places(effects, refit.effects):
+                    if newcomer not in alike[place]:
+                        alike[place].append(newcomer)
+        return {name: tuple(group) for name, group in alike.items()}
+
+    def _freedom(self, effects: Collection[str]) -> int:
+        """Visible directions of all the effects."""
+        return sum(self._degrees.get(name, 1) for name in effects)
+
+    def _places(self, effects: tuple[str, ...], others: tuple[str, ...]) -> list[tuple[str, str]]:
+        """Which of the accepted effects each name of another set stands for."""
+        gone = [n for n in effects if n not in others]
+        new = [n for n in others if n not in effects]
+        if len(gone) == len(new) == 1:
+            return [(gone[0], new[0])]
+        here = self.round(effects)
+        library = here.library
+        sizes = dict(zip(here.members, library.explained(here.members).sizes, strict=True))
+        member = {library.candidates[i].name: i for i in here.members}
+        likeness = np.array([[max((library.copied(member[g], sizes[member[g]], i) for i in library.indices(n)),
+                                  default=0.0) for n in new] for g in gone])
+        rows, columns = linear_sum_assignment(-likeness)
+        return [(gone[r], new[c]) for r, c in zip(rows, columns, strict=True)]
 
     def plausible(self, name: str, refit: Refit) -> bool:
         """Whether the fitted size agrees with what the physics demands and an engineer would believe."""
@@ -601,14 +626,15 @@ class Workflow:
 
     def _findings(self, order: tuple[str, ...], excluded: Collection[str]) -> tuple[Finding, ...]:
         findings = []
+        self.say("what explains the data as well")
+        groups = self.groups(order, excluded) if order else {}
         for k, name in enumerate(order):
-            self.say(f"what explains the data as well as {name}")
             second, first = (self.fit(order[:j], self.fit(order)) for j in (k + 1, k))
             expected = next((s for s in self.round(order[:k]).table if s.name == name), None)
             assert expected is not None
             one, two = first.estimate, second.estimate
             findings.append(Finding(
-                name, self.group(order, name, excluded), first.cost - second.cost, self._degrees.get(name, 1),
+                name, groups[name], first.cost - second.cost, self._degrees.get(name, 1),
                 self.loss(order, name)[1], misfit(one.problem, one.parts, held_out=False),
                 misfit(two.problem, two.parts, held_out=False), misfit(one.problem, one.parts, held_out=True),
                 misfit(two.problem, two.parts, held_out=True), expected, shifts(one, two)))
