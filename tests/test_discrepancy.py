@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import casadi as ca
 import numpy as np
@@ -18,6 +19,7 @@ from estimator.discrepancy.score import (
     Stack,
     log_evidence,
     orthonormalized,
+    products,
     scored,
     settings,
     signature,
@@ -47,7 +49,7 @@ def stack_of(jacobian: np.ndarray, residual: np.ndarray) -> Stack:
 
 
 def candidate(declared: EffectInstance, columns: np.ndarray) -> Signature:
-    return Signature(declared, np.zeros(len(declared.parameters)), np.arange(columns.shape[1]), columns,
+    return Signature(declared, np.zeros(len(declared.parameters)), np.arange(columns.shape[1]), {"all": columns},
                      {"all": slice(0, len(columns))})
 
 
@@ -80,7 +82,19 @@ def test_stack_by_residuals_is_that_of_the_whole_jacobian() -> None:
     np.testing.assert_allclose(made.basis.T @ made.basis, np.eye(rank), atol=1e-13)
     np.testing.assert_allclose(made.jacobian, whole)
     np.testing.assert_allclose(made.gram, whole.T @ whole, atol=1e-12)
-    np.testing.assert_allclose(made.along(columns), whole.T @ columns, atol=1e-12)
+    some = Signature(ordinary(3), np.zeros(3), np.arange(3), {"b": columns[4:54]}, made.blocks)
+    np.testing.assert_allclose(made.along(some), whole[4:54].T @ columns[4:54], atol=1e-12)
+    np.testing.assert_array_equal(some.columns[4:54], columns[4:54])
+    assert not some.columns[:4].any() and not some.columns[54:].any()
+    parts = {"c": columns[54:, :2], "a": columns[:4, 1:]}
+    other = Signature(ordinary(2), np.zeros(2), np.arange(2), parts, made.blocks)
+    found = products(made, (some, other), residual[:, None])
+    both = np.concatenate([some.columns, other.columns], axis=1)
+    rest = both - made.basis @ (made.basis.T @ both)
+    assert found.places == (slice(0, 3), slice(3, 5))
+    np.testing.assert_allclose(found.raw, both.T @ both, atol=1e-12)
+    np.testing.assert_allclose(found.left, rest.T @ rest, atol=1e-12)
+    np.testing.assert_allclose(found.against, rest.T @ residual[:, None], atol=1e-12)
     np.testing.assert_allclose(made.carried(columns), made.basis.T @ columns, atol=1e-12)
     left = columns - whole @ np.linalg.lstsq(whole, columns, rcond=1e-12)[0]
     np.testing.assert_allclose(made.projected(columns), left, atol=1e-12)
@@ -154,14 +168,20 @@ def test_settings_are_the_grid_of_the_searched_parameters() -> None:
 # ---------------------------------------------------------------------------------------------------- false alarms
 
 
+def looks_of(blocks: list[np.ndarray]) -> float:
+    together = np.concatenate(blocks, axis=1)
+    degrees = [b.shape[1] for b in blocks]
+    ends = np.cumsum([0, *degrees])
+    return effective_looks(together.T @ together, degrees, [slice(a, b) for a, b in pairwise(ends)])
+
+
 def test_looks_make_the_simulated_search_keep_its_level() -> None:
     """Brute force: noise, every candidate fitted by its own least squares, the smallest p of the whole library."""
     draw = np.random.default_rng(8)
     common = draw.standard_normal((60, 4))
     blocks = [common[:, : 1 + k % 3] + 0.5 * draw.standard_normal((60, 1 + k % 3)) for k in range(12)]
     blocks += [draw.standard_normal((60, 2)) for _ in range(6)]
-    degrees = [b.shape[1] for b in blocks]
-    looks = effective_looks(blocks, degrees)
+    looks = looks_of(blocks)
     assert 3 < looks < len(blocks) * 1.3
     bases = [np.linalg.qr(b)[0] for b in blocks]
     trials = 6000
@@ -175,12 +195,12 @@ def test_looks_make_the_simulated_search_keep_its_level() -> None:
 
 def test_one_candidate_is_one_look_and_many_independent_ones_are_many() -> None:
     basis = np.eye(80)
-    assert effective_looks([basis[:, :1]], [1]) == pytest.approx(1.0, rel=0.3)
-    many = effective_looks([basis[:, k : k + 1] for k in range(80)], [1] * 80)
+    assert looks_of([basis[:, :1]]) == pytest.approx(1.0, rel=0.3)
+    many = looks_of([basis[:, k : k + 1] for k in range(80)])
     assert many == pytest.approx(80, rel=0.25)
-    copies = effective_looks([basis[:, :1] for _ in range(80)], [1] * 80)
+    copies = looks_of([basis[:, :1] for _ in range(80)])
     assert copies == pytest.approx(1.0, rel=0.3)
-    assert effective_looks([], []) == 1.0
+    assert effective_looks(np.zeros((0, 0)), [], []) == 1.0
 
 
 def test_probability_after_the_search() -> None:

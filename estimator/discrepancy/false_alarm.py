@@ -16,31 +16,34 @@ from scipy.stats import chi2
 DRAWS = 4000
 
 
-def effective_looks(projected: Sequence[np.ndarray], degrees: Sequence[int], *, draws: int = DRAWS,
+def effective_looks(gram: np.ndarray, degrees: Sequence[int], places: Sequence[slice], *, draws: int = DRAWS,
                     seed: int = 20240301) -> float:
     """How many independent looks a search over these candidates amounts to.
 
     Args:
-        projected: signature columns (rows, k) of every candidate and setting, calibration projected out.
-        degrees: visible directions of each.
+        gram: (m, m) products of the signature columns of all candidates and settings, calibration projected out.
+        degrees: visible directions of each candidate.
+        places: the columns of each.
         draws: simulated searches.
         seed: of the draws.
 
     Returns:
         N such that the probability of a smallest p-value below p is ``1 - (1 - p)^N`` near the 1 % level.
     """
-    chosen = [(p, d) for p, d in zip(projected, degrees, strict=True) if d > 0]
+    chosen = [(p, d) for p, d in zip(places, degrees, strict=True) if d > 0]
     if not chosen:
         return 1.0
-    whitened = []
-    for columns, degree in chosen:
-        norms = np.linalg.norm(columns, axis=0)
-        norms[norms == 0] = 1.0
-        gram = (columns / norms).T @ (columns / norms)
-        eigenvalues, vectors = np.linalg.eigh(gram)
-        whitened.append((columns / norms) @ (vectors[:, -degree:] / np.sqrt(np.maximum(eigenvalues[-degree:], 1e-300))))
-    together = np.concatenate(whitened, axis=1)
-    covariance = together.T @ together
+    norms = np.sqrt(np.maximum(np.diag(gram), 0.0))
+    norms[norms == 0] = 1.0
+    correlation = gram / np.outer(norms, norms)
+    whitening = np.zeros((len(gram), sum(d for _, d in chosen)))
+    start = 0
+    for place, degree in chosen:
+        eigenvalues, vectors = np.linalg.eigh(correlation[place, place])
+        whitening[place, start : start + degree] = \
+            vectors[:, -degree:] / np.sqrt(np.maximum(eigenvalues[-degree:], 1e-300))
+        start += degree
+    covariance = whitening.T @ correlation @ whitening
     eigenvalues, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
     samples = np.random.default_rng(seed).standard_normal((draws, len(eigenvalues))) @ root.T

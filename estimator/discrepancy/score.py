@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from scipy.stats import chi2
@@ -32,15 +33,24 @@ class Signature:
         effect: the candidate.
         setting: its start values (parameters,), searched ones at the value tried.
         ordinary: indices of the ordinary parameters, those of the columns.
-        columns: (rows, ordinary) whitened and weighted, scaled by the parameters' scales.
+        parts: of each residual that the effect touches, by name, its rows (n, ordinary) of the columns, whitened and
+            weighted, scaled by the parameters' scales.
         blocks: rows of each residual by name.
     """
 
     effect: EffectInstance
     setting: np.ndarray
     ordinary: np.ndarray
-    columns: np.ndarray
+    parts: Mapping[str, np.ndarray]
     blocks: Mapping[str, slice]
+
+    @cached_property
+    def columns(self) -> np.ndarray:
+        """(rows, ordinary) the columns on all rows."""
+        result = np.zeros((max((b.stop for b in self.blocks.values()), default=0), len(self.ordinary)))
+        for name, part in self.parts.items():
+            result[self.blocks[name]] = part
+        return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,11 +148,11 @@ class Stack:
             result[np.ix_(piece.felt, piece.felt)] += piece.jacobian.T @ piece.jacobian
         return result
 
-    def along(self, columns: np.ndarray) -> np.ndarray:
-        """Products (p, k) of the fit's Jacobian with ``columns`` (rows, k)."""
-        result = np.zeros((sum(u.manifold.tangent for u in self.columns), columns.shape[1]))
-        for piece in self.pieces.values():
-            result[piece.felt] += piece.jacobian.T @ columns[piece.rows]
+    def along(self, candidate: Signature) -> np.ndarray:
+        """Products (p, k) of the fit's Jacobian with the columns of a candidate."""
+        result = np.zeros((sum(u.manifold.tangent for u in self.columns), len(candidate.ordinary)))
+        for name, part in candidate.parts.items():
+            result[self.pieces[name].felt] += self.pieces[name].jacobian.T @ part
         return result
 
     def carried(self, columns: np.ndarray) -> np.ndarray:
@@ -253,33 +263,73 @@ def signature(stacked: Stack, problem: Problem, parts: Sequence[Linearization], 
     ordinary = np.array([i for i, p in enumerate(effect.parameters) if whole or p.search is None], dtype=int)
     unknown = problem.unknown(effect.name)
     typical = np.array([p.scale for p in effect.parameters]) / unknown.scales
-    columns = np.zeros((len(stacked.residual), len(effect.parameters)))
+    found = {}
     for residual, part in zip(problem.residuals, parts, strict=True):
         if all(u.name != effect.name for u in residual.unknowns) or residual.name not in stacked.blocks:
             continue
         rows = stacked.blocks[residual.name]
         _, block = rows_of(part, (unknown,), stacked.scale[residual.name])
         if rows.stop - rows.start == len(block):
-            columns[rows] = block * typical
-    return Signature(effect, setting, ordinary, columns[:, ordinary], stacked.blocks)
+            found[residual.name] = (block * typical)[:, ordinary]
+    return Signature(effect, setting, ordinary, found, stacked.blocks)
 
 
 def on_rows(candidate: Signature, stacked: Stack) -> Signature:
     """The same signature on the rows of another stack; residuals are matched by name."""
-    columns = np.zeros((len(stacked.residual), candidate.columns.shape[1]))
-    for name, rows in candidate.blocks.items():
-        if name in stacked.blocks:
-            columns[stacked.blocks[name]] = candidate.columns[rows] / stacked.scale[name]
-    return Signature(candidate.effect, candidate.setting, candidate.ordinary, columns, stacked.blocks)
+    parts = {name: part / stacked.scale[name] for name, part in candidate.parts.items() if name in stacked.blocks}
+    return Signature(candidate.effect, candidate.setting, candidate.ordinary, parts, stacked.blocks)
 
 
-def scored(stacked: Stack, candidate: Signature, projected: np.ndarray | None = None) -> Score:
+@dataclass(frozen=True, eq=False)
+class Products:
+    """All that scores need of the columns of some signatures, one after the other.
+
+    Attributes:
+        places: the columns of each signature.
+        raw: (m, m) products of the columns with each other.
+        left: (m, m) the same of what the fit does not absorb of them.
+        against: (m, k) products of what the fit does not absorb with the given rows.
+    """
+
+    places: tuple[slice, ...]
+    raw: np.ndarray
+    left: np.ndarray
+    against: np.ndarray
+
+
+def products(stacked: Stack, signatures: Sequence[Signature], right: np.ndarray) -> Products:
+    """Products of signatures with each other and with ``right`` (rows, k), the fit's columns projected out.
+
+    With Q the orthonormal columns of the fit, what is left of columns B has the products ``B'B - (Q'B)'(Q'B)``: a
+    visible part of 1e-8 of the square is right to 1e-7.
+    """
+    edges = np.cumsum([0, *(len(s.ordinary) for s in signatures)])
+    raw, direct = np.zeros((edges[-1], edges[-1])), np.zeros((edges[-1], right.shape[1]))
+    absorbed = stacked.carried(right)
+    carried = np.zeros((len(absorbed), edges[-1]))
+    for name, piece in stacked.pieces.items():
+        touching = [(np.arange(a, b), s.parts[name]) for s, (a, b) in zip(signatures, pairwise(edges), strict=True)
+                    if name in s.parts]
+        if not touching:
+            continue
+        index = np.concatenate([place for place, _ in touching])
+        columns = np.concatenate([part for _, part in touching], axis=1)
+        raw[np.ix_(index, index)] += columns.T @ columns
+        carried[:, index] += piece.inner.T @ (piece.span.T @ columns)
+        direct[index] += columns.T @ right[piece.rows]
+    places = tuple(slice(int(a), int(b)) for a, b in pairwise(edges))
+    return Products(places, raw, raw - carried.T @ carried, direct - carried.T @ absorbed)
+
+
+def scored(stacked: Stack, candidate: Signature) -> Score:
     """Score one candidate at one setting."""
-    columns = candidate.columns
-    left = stacked.projected(columns) if projected is None else projected
-    raw = columns.T @ columns
-    matrix = left.T @ left
-    gradient = left.T @ stacked.residual
+    return score_of(stacked, candidate, products(stacked, (candidate,), stacked.residual[:, None]), 0)
+
+
+def score_of(stacked: Stack, candidate: Signature, given: Products, number: int) -> Score:
+    """Score a candidate, the columns of which are those with this number in products with the stack's residual."""
+    place = given.places[number]
+    raw, matrix, gradient = given.raw[place, place], given.left[place, place], given.against[place, 0]
     scales = np.array([candidate.effect.parameters[i].scale for i in candidate.ordinary])
     size_raw = np.sqrt(np.maximum(np.diag(raw), 1e-300))
     relative = matrix / np.outer(size_raw, size_raw)
@@ -294,7 +344,7 @@ def scored(stacked: Stack, candidate: Signature, projected: np.ndarray | None = 
     sigma = np.full(len(size), np.inf)
     if degrees == 0:
         return Score(candidate.effect.name, candidate.setting, 0.0, 0, 1.0, size, sigma, 0.0,
-                     _absorbers(stacked, columns), -np.inf, 0.0)
+                     _absorbers(stacked, candidate), -np.inf, 0.0)
     back = vectors[:, visible] / size_raw[:, None]
     inverse = (back / eigenvalues[visible]) @ back.T
     step = -inverse @ gradient
@@ -310,7 +360,7 @@ def scored(stacked: Stack, candidate: Signature, projected: np.ndarray | None = 
     typical = float(np.trace(matrix)) / len(scales)
     power = float(1 - _noncentral(chi2.ppf(0.99, degrees), degrees, typical))
     return Score(candidate.effect.name, candidate.setting, score, degrees, float(chi2.sf(score, degrees)), size, sigma,
-                 share, _absorbers(stacked, columns) if share < 1e-3 else (), evidence, power)
+                 share, _absorbers(stacked, candidate) if share < 1e-3 else (), evidence, power)
 
 
 def log_evidence(effect: EffectInstance, ordinary: np.ndarray, information: np.ndarray, gradient: np.ndarray) -> float:
@@ -346,11 +396,11 @@ def _noncentral(threshold: float, degrees: int, shift: float) -> float:
     return float(ncx2.cdf(threshold, degrees, min(shift, 1e4)))
 
 
-def _absorbers(stacked: Stack, columns: np.ndarray) -> tuple[str, ...]:
+def _absorbers(stacked: Stack, candidate: Signature) -> tuple[str, ...]:
     """Unknowns of the fit whose movement imitates the signature most, largest first."""
     gram = stacked.gram
     regular = gram + 1e-12 * np.trace(gram) / len(gram) * np.eye(len(gram))
-    solution = np.linalg.solve(regular, stacked.along(columns))
+    solution = np.linalg.solve(regular, stacked.along(candidate))
     moved = {u.name: float(np.sqrt(max(np.sum(solution[c] * (gram[c, c] @ solution[c])), 0.0)))
              for u, c in zip(stacked.columns, offsets(stacked.columns).values(), strict=True)}
     largest = max(moved.values(), default=0.0)

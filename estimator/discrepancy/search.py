@@ -13,7 +13,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -23,7 +22,17 @@ from estimator.discrepancy.combinations import Candidate, LinearLibrary, price, 
 from estimator.discrepancy.false_alarm import after_search, effective_looks
 from estimator.discrepancy.gap import Gap, find_gap
 from estimator.discrepancy.proof import HeldOut, channels_of, misfit, pays, shifts
-from estimator.discrepancy.score import Score, Signature, Stack, on_rows, scored, settings, signature, stack
+from estimator.discrepancy.score import (
+    Score,
+    Signature,
+    Stack,
+    on_rows,
+    products,
+    score_of,
+    settings,
+    signature,
+    stack,
+)
 from estimator.discrepancy.subject import Subject
 from estimator.estimate import Estimate
 from estimator.problem import Problem
@@ -236,10 +245,10 @@ class Workflow:
         signatures += [on_rows(s, base) for s in self.searched_signatures()]
         mine = [signature(base, problem, parts, self.library[n], np.asarray(point[n], dtype=float), whole=True)
                 for n in key if n in present]
-        library, members, projected, chosen = self._linear_model(base, stacked, signatures, mine)
-        own = np.linalg.qr(projected[-1])[0] if mine and projected[-1].size else np.zeros((len(base.residual), 0))
-        scores = [scored(stacked, signatures[i], projected[i] - own @ (own.T @ projected[i])) for i in chosen
-                  if signatures[i].effect.name not in key]
+        library, members, chosen = self._linear_model(base, stacked, signatures, mine)
+        candidates = [signatures[i] for i in chosen if signatures[i].effect.name not in key]
+        beside = products(stacked, candidates, stacked.residual[:, None])
+        scores = [score_of(stacked, s, beside, i) for i, s in enumerate(candidates)]
         best: dict[str, Score] = {}
         for s in scores:
             if s.name not in best or s.score > best[s.name].score:
@@ -252,35 +261,30 @@ class Workflow:
     def _count_looks(self, base: Stack, signatures: Sequence[Signature]) -> None:
         """How many independent looks the search of this library amounts to."""
         self.say("rate of false alarms")
-        widths = np.cumsum([0, *(s.columns.shape[1] for s in signatures)])
-        raw = np.concatenate([s.columns for s in signatures], axis=1)
-        left = base.projected(raw)
-        places = [slice(a, b) for a, b in pairwise(widths)]
-        degrees = [visible_directions(raw[:, p].T @ raw[:, p], left[:, p].T @ left[:, p]).shape[1] for p in places]
-        self.looks = effective_looks([left[:, p] for p in places], degrees)
+        found = products(base, signatures, base.residual[:, None])
+        degrees = [visible_directions(found.raw[p, p], found.left[p, p]).shape[1] for p in found.places]
+        self.looks = effective_looks(found.left, degrees, found.places)
 
     def _linear_model(self, base: Stack, stacked: Stack, signatures: Sequence[Signature], mine: Sequence[Signature],
-                      ) -> tuple[LinearLibrary, tuple[int, ...], list[np.ndarray], list[int]]:
-        """The linear library, the indices of the accepted effects in it, the projected columns of every signature
-        (and of all accepted effects, last), and the signatures whose setting takes part."""
+                      ) -> tuple[LinearLibrary, tuple[int, ...], list[int]]:
+        """The linear library, the indices of the accepted effects in it, and the signatures whose setting takes
+        part."""
         everything = [*signatures, *mine]
-        widths = np.cumsum([0, *(s.columns.shape[1] for s in everything)])
-        raw = np.concatenate([s.columns for s in everything], axis=1)
-        together = base.projected(raw)
-        places = [slice(a, b) for a, b in pairwise(widths)]
-        bare = base.residual.copy()  # the residuals as they would be without the accepted effects
+        now = stacked.projected(stacked.residual)
+        found = products(base, everything, np.column_stack([base.residual, now]))
+        places = found.places
+        known = np.zeros(len(found.raw))  # what the accepted effects have explained already
         for s, place in zip(mine, places[len(signatures) :], strict=True):
             ordinary = np.array([p.search is None for p in s.effect.parameters])
             scales = np.array([p.scale for p in s.effect.parameters])
-            bare -= raw[:, place] @ np.where(ordinary, s.setting / scales, 0.0)
-        right = -(together.T @ bare)
-        now = -(together.T @ stacked.projected(stacked.residual))
+            known[place] = np.where(ordinary, s.setting / scales, 0.0)
+        right = found.left @ known - found.against[:, 0]
         blocks, strength = [], []
         for s, place in zip(everything, places, strict=True):
-            matrix = together[:, place].T @ together[:, place]
-            seen = visible_directions(raw[:, place].T @ raw[:, place], matrix)
+            seen = visible_directions(found.raw[place, place], found.left[place, place])
             blocks.append(seen)
-            strength.append((float(np.sum((seen.T @ right[place]) ** 2)), float(np.sum((seen.T @ now[place]) ** 2))))
+            strength.append((float(np.sum((seen.T @ right[place]) ** 2)),
+                             float(np.sum((seen.T @ found.against[place, 1]) ** 2))))
             self._degrees[s.effect.name] = max(self._degrees.get(s.effect.name, 0), seen.shape[1])
         chosen: set[int] = set()
         for name in dict.fromkeys(s.effect.name for s in signatures):
@@ -289,11 +293,11 @@ class Workflow:
                 chosen |= set(sorted(own, key=lambda i: -strength[i][k])[:TRIED_SETTINGS])
         kept = sorted(chosen) + list(range(len(signatures), len(everything)))
         columns = np.concatenate([np.zeros(0, dtype=int), *(np.arange(places[i].start, places[i].stop) for i in kept)])
-        gram = together[:, columns].T @ together[:, columns]
+        gram = found.left[np.ix_(columns, columns)]
         candidates, start = [], 0
         for i in kept:
             s = everything[i]
-            width = s.columns.shape[1]
+            width = len(s.ordinary)
             nominal = None
             if any(p.nominal is not None for p in s.effect.parameters):
                 nominal = np.array([(s.effect.parameters[k].nominal or 0.0) / s.effect.parameters[k].scale
@@ -302,9 +306,7 @@ class Workflow:
                                         nominal if blocks[i].shape[1] else None))
             start += width
         members = tuple(range(len(candidates) - len(mine), len(candidates)))
-        last = together[:, places[len(signatures)].start :] if mine else np.zeros((len(bare), 0))
-        projected = [together[:, p] for p in places[: len(signatures)]] + [last]
-        return LinearLibrary(candidates, gram, right[columns]), members, projected, sorted(chosen)
+        return LinearLibrary(candidates, gram, right[columns]), members, sorted(chosen)
 
     def searched_signatures(self) -> list[Signature]:
         """Signatures of the effects with searched parameters, one per setting, taken once at the plain fit.
@@ -341,13 +343,12 @@ class Workflow:
     def _refine(self, base: Stack, stacked: Stack, skipped: Collection[str]) -> None:
         """Add settings between those of the grid where the residuals speak for an effect: a lightly damped mode or a
         jump is seen only close to its frequency or time."""
-        now = stacked.projected(stacked.residual)
+        now = stacked.projected(stacked.residual)[:, None]
 
         def drop(trial: Signature) -> tuple[float, int]:
-            columns = on_rows(trial, base).columns
-            left = base.projected(columns)
-            seen = visible_directions(columns.T @ columns, left.T @ left)
-            return float(np.sum((seen.T @ (left.T @ now)) ** 2)), seen.shape[1]
+            found = products(base, (on_rows(trial, base),), now)
+            seen = visible_directions(found.raw, found.left)
+            return float(np.sum((seen.T @ found.against) ** 2)), seen.shape[1]
 
         for name in self._trials:
             own = [s for s in self.searched_signatures() if s.effect.name == name]
