@@ -311,6 +311,8 @@ def run(case: Case, rivals: bool) -> dict[str, Any]:
             "gap_p": findings.before.p_value, "gap_after_p": findings.after.p_value,
         }
         result["truth_ahead"] = _ahead(workflow, campaign, case, result)
+        if case.kind == "one":
+            result["apart"] = _apart(workflow, case, truth[case.effects[0]])
         result["cpu_seconds"] = time.process_time() - cpu
         if rivals:
             result["rivals"] = rival_answers(workflow)
@@ -346,6 +348,22 @@ def _ahead(workflow: Any, campaign: Any, case: Case, result: dict[str, Any]) -> 
 
 def _ratio(before: Any, after: Any) -> dict[str, list[float]]:
     return {c: [round(before[c].ratio, 4), round(after[c].ratio, 4)] for c in before if c in after}
+
+
+def _apart(workflow: Any, case: Case, values: Sequence[float]) -> float | None:
+    """Sigma of a true effect that its best copy by another name of the library leaves over; a property of the
+    campaign, not of the answer. None where the library does not see the truth."""
+    library = workflow.round(()).library
+    name, size = case.effects[0], np.asarray(values, dtype=float)
+    own = library.indices(name)
+    if not own:
+        return None
+    effect = library.candidates[own[0]].effect
+    searched = [k for k, p in enumerate(effect.parameters) if p.search is not None]
+    range_of = np.array([p.search[1] - p.search[0] if p.search else 1.0 for p in effect.parameters])
+    near = min(own, key=lambda i: float(np.sum(((library.candidates[i].setting - size) / range_of)[searched] ** 2)))
+    copied = max((library.copied(near, size, i) for i, c in enumerate(library.candidates) if c.name != name), default=0)
+    return float(case.size * np.sqrt(max(1.0 - copied, 0.0)))
 
 
 # ---------------------------------------------------------------------------------------------------- rivals
@@ -532,6 +550,8 @@ def right(entry: dict[str, Any]) -> bool:
         all(any(t in g for t in truths) for g in groups)
 
 
+IDENTIFIABLE = 3.03
+"""Sigma that the best copy of an effect by another name must leave over: half its square is a log odds of 100 to 1."""
 LOOK_ALIKE = 20.0
 """Lead in the sum of squares (4.5 sigma) up to which data do not tell the truth from what was named instead."""
 
@@ -561,6 +581,8 @@ def summary(entries: Iterable[dict[str, Any]]) -> dict[str, Any]:
         chosen = [e for e in by_kind["one"] if e["size"] == size]
         hits = [e for e in chosen if right(e)]
         sizes = [len(f["group"]) for e in hits for f in e["found"]]
+        clear = [e for e in hits if (e.get("apart") or 0.0) >= IDENTIFIABLE]
+        alone = [len(f["group"]) for e in clear for f in e["found"]]
         wrong = [e for e in chosen if any(not set(f["group"]) & set(e["truth"]) for f in e["found"])]
         one[f"{size:g} sigma"] = {
             "campaigns": len(chosen), "right": len(hits) / len(chosen), "single_right":
@@ -569,6 +591,8 @@ def summary(entries: Iterable[dict[str, Any]]) -> dict[str, Any]:
             "wrong_by_a_look_alike": sum(map(_look_alike, wrong)) / len(chosen),
             "nothing": sum(not e["found"] for e in chosen) / len(chosen),
             "median_group": float(np.median(sizes)) if sizes else None,
+            "identifiable": sum((e.get("apart") or 0.0) >= IDENTIFIABLE for e in chosen),
+            "median_group_identifiable": float(np.median(alone)) if alone else None,
             "by_effect": {n: _share([right(e) for e in chosen if e["effects"][0] == n])
                           for n in sorted({e["effects"][0] for e in chosen})},
         }
@@ -679,6 +703,8 @@ def page(result: dict[str, Any]) -> str:
     for size, one in result.get("one", {}).items():
         row(f"one effect of {size}: right", one["campaigns"], f"{_percent(one['right'])}; alone "
             f"{_percent(one['single_right'])}; median group {one['median_group'] or 0:g}")
+        row(f"one effect of {size}: no other name copies it to below {IDENTIFIABLE:g} sigma", one["identifiable"],
+            f"median group {one['median_group_identifiable'] or 0:g}")
         row(f"one effect of {size}: another name, of these look-alikes", one["campaigns"],
             f"{_percent(one['wrong_name'])}, {_percent(one['wrong_by_a_look_alike'])}")
         row(f"one effect of {size}: no name", one["campaigns"], _percent(one["nothing"]))

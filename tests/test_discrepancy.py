@@ -13,7 +13,7 @@ from scipy.stats import binom, chi2
 
 from estimator.discrepancy.false_alarm import after_search, effective_looks
 from estimator.discrepancy.gap import find_gap
-from estimator.discrepancy.proof import misfit, pays, shifts
+from estimator.discrepancy.proof import _prediction, misfit, pays, shifts
 from estimator.discrepancy.score import (
     Signature,
     Stack,
@@ -363,10 +363,24 @@ def test_an_addition_pays_where_held_out_samples_bear_it_out() -> None:
         measured[:, 1] += curve
         plain = solve(problem_of(time, measured, 0.1, accepted=used))
         bent = solve(problem_of(time, measured, 0.1, curved=True, accepted=used).freeing("candidate"))
-        return pays(plain.problem, plain.parts, bent.problem, bent.parts, ("doppler",))
+        return pays(plain, bent, ("doppler",))
 
     assert verdict(0.5 * time**2)
     assert not verdict(np.where(used, 0.5 * time**2, -1.0))
+
+
+def test_held_out_misses_are_weighed_by_the_covariance_of_the_prediction() -> None:
+    """In a linear problem their weighed sum of squares is what the minimum rises by when the samples are fitted too."""
+    draw = np.random.default_rng(21)
+    time = np.linspace(-1, 1, 120)
+    used = time < 0.3
+    measured = (2 + time)[:, None] * np.ones(2) + 0.1 * draw.standard_normal((len(time), 2))
+    part = solve(problem_of(time, measured, 0.1, accepted=used))
+    whole = solve(problem_of(time, measured, 0.1))
+    predicted = _prediction(part, ("doppler",), {r.name for r in part.problem.residuals})
+    rise = sum(p.cost for p in whole.parts) - sum(p.cost for p in part.parts)
+    assert predicted.product(predicted.miss, predicted.miss) == pytest.approx(rise, rel=1e-9)
+    assert predicted.product(predicted.miss, predicted.miss) < predicted.miss @ predicted.miss
 
 
 def test_rows_of_rejected_samples_are_silent() -> None:

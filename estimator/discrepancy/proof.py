@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from estimator.estimate import Estimate
-from estimator.problem import Problem
+from estimator.problem import Problem, normal_equations, offsets
 from estimator.residuals import KernelResidual, Linearization, Residual
 from estimator.trajectory_residual import TrajectoryResidual
 
@@ -68,26 +68,75 @@ def _samples(residual: Residual, part: Linearization, held_out: bool) -> tuple[n
     return np.zeros((0, 1)), np.zeros((0, 1))
 
 
-def pays(before: Problem, before_parts: Sequence[Linearization], after: Problem,
-         after_parts: Sequence[Linearization], channels: Sequence[str]) -> bool:
+@dataclass(frozen=True, eq=False)
+class _Prediction:
+    """Held-out samples as a fit predicts them, whitened by their noise alone.
+
+    Attributes:
+        miss: (n,) measured minus predicted.
+        columns: (n, p) its derivative along the p free unknowns, in their scales.
+        spread: (p, p) inverse of the information that training and held-out samples have together.
+    """
+
+    miss: np.ndarray
+    columns: np.ndarray
+    spread: np.ndarray
+
+    def product(self, a: np.ndarray, b: np.ndarray) -> float:
+        """``a' S^-1 b`` with S = 1 + H P H', the covariance of what the fit predicts (Woodbury's identity)."""
+        return float(a @ b - (self.columns.T @ a) @ self.spread @ (self.columns.T @ b))
+
+
+def _held_out(estimate: Estimate, channels: Collection[str], names: Collection[str]) -> np.ndarray:
+    """Misses (n,) of the held-out samples of these channels and residuals, whitened by their noise."""
+    return np.concatenate([np.zeros(0), *(
+        _samples(r, p, True)[0].ravel() for r, p in zip(estimate.problem.residuals, estimate.parts, strict=True)
+        if r.channel in channels and r.name in names)])
+
+
+def _prediction(estimate: Estimate, channels: Collection[str], names: Collection[str]) -> _Prediction:
+    free = estimate.problem.free
+    places = offsets(free)
+    scales = np.concatenate([np.zeros(0), *(u.scales for u in free)])
+    blocks = [np.zeros((0, len(scales)))]
+    for residual, part in zip(estimate.problem.residuals, estimate.parts, strict=True):
+        if residual.channel not in channels or residual.name not in names:
+            continue
+        rows = np.zeros((_samples(residual, part, True)[0].size, len(scales)))
+        if isinstance(residual, KernelResidual) and residual.accepted is not None:
+            jacobian = part.jacobian[~residual.accepted].reshape(len(rows), -1)
+            start = 0
+            for u in part.columns:
+                width = u.manifold.tangent
+                if u.name in places:
+                    rows[:, places[u.name]] = jacobian[:, start : start + width]
+                start += width
+        blocks.append(rows)
+    columns = np.concatenate(blocks) * scales
+    training = normal_equations(estimate.problem, estimate.values, estimate.parts).matrix
+    eigenvalues, vectors = np.linalg.eigh(training + columns.T @ columns)
+    kept = eigenvalues > 1e-14 * max(float(np.max(eigenvalues, initial=0.0)), 1e-300)
+    basis = vectors[:, kept]
+    return _Prediction(_held_out(estimate, channels, names), columns, (basis / eigenvalues[kept]) @ basis.T)
+
+
+def pays(before: Estimate, after: Estimate, channels: Collection[str]) -> bool:
     """Whether the held-out samples of the channels that an effect changes bear the effect out.
 
-    With ``d`` the length of the change that the effect makes to the whitened held-out samples, their sum of squares
-    drops by ``d^2`` give or take ``2 d`` if the effect is real and its size is known. The fitted sizes err, and with
-    them the states that are carried on to the held-out end of an arc: up to an eighth of ``d^2`` of such error is
-    allowed for, which takes a quarter of the drop. An addition is refused when the sum rises although that is
-    improbable (0.1 %) even so.
+    The misses are weighed by the covariance of the prediction without the effect, that of the noise and of the fit
+    together: the state that is carried on to the held-out end of an arc may err by more than its samples' noise. With
+    ``d`` the length of the change that the effect makes to the held-out samples in that measure, their sum of squares
+    drops by ``d^2`` give or take ``2 d`` if the effect is real and its size is known. The fitted size errs: up to an
+    eighth of ``d^2`` of such error is allowed for, which takes a quarter of the drop. An addition is refused when the
+    sum rises although that is improbable (0.1 %) even so.
     """
-    drop, change = 0.0, 0.0
-    later = {r.name: (r, p) for r, p in zip(after.residuals, after_parts, strict=True)}
-    for residual, part in zip(before.residuals, before_parts, strict=True):
-        if residual.channel not in channels or residual.name not in later:
-            continue
-        first, _ = _samples(residual, part, True)
-        second, _ = _samples(*later[residual.name], True)
-        drop += float(np.sum(first**2) - np.sum(second**2))
-        change += float(np.sum((first - second) ** 2))
-    return drop > 0 or drop > 0.75 * change - 3.09 * 2 * float(np.sqrt(change))
+    names = {r.name for r in before.problem.residuals} & {r.name for r in after.problem.residuals}
+    first = _prediction(before, channels, names)
+    missed = _held_out(after, channels, names)
+    moved = first.miss - missed
+    drop = first.product(first.miss, first.miss) - first.product(missed, missed)
+    change = first.product(moved, moved)
+    return drop > 0 or drop > 0.75 * change - 3.09 * 2 * float(np.sqrt(max(change, 0.0)))
 
 
 def channels_of(problem: Problem, name: str) -> tuple[str, ...]:

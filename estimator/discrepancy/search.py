@@ -623,7 +623,7 @@ class Workflow:
         """Whether held-out data bear out one of the effects beside the others."""
         near = self.fit(effects)
         second, first = near.estimate, self.fit([n for n in effects if n != name], near).estimate
-        return pays(first.problem, first.parts, second.problem, second.parts, channels_of(second.problem, name))
+        return pays(first, second, channels_of(second.problem, name))
 
     def _findings(self, order: tuple[str, ...], excluded: Collection[str]) -> tuple[Finding, ...]:
         findings = []
