@@ -154,9 +154,9 @@ def direction(effect: Any, draw: np.random.Generator) -> np.ndarray:
     values = np.zeros(len(effect.parameters))
     for i, p in enumerate(effect.parameters):
         if p.search is not None:
-            low, high = p.search[:2]
             share = draw.uniform(0.1, 0.9)
-            values[i] = low * (high / low) ** share if p.search[3] == "logarithmic" else low + (high - low) * share
+            low, high, _, spacing = p.search  # of a frequency every octave is as likely
+            values[i] = low + (high - low) * share if spacing == "linear" else low * (high / low) ** share
         elif p.nominal is not None:
             values[i] = p.nominal
         else:
@@ -360,7 +360,7 @@ def _apart(workflow: Any, case: Case, values: Sequence[float]) -> float | None:
         return None
     effect = library.candidates[own[0]].effect
     searched = [k for k, p in enumerate(effect.parameters) if p.search is not None]
-    range_of = np.array([p.search[1] - p.search[0] if p.search else 1.0 for p in effect.parameters])
+    range_of = np.array([p.search.high - p.search.low if p.search else 1.0 for p in effect.parameters])
     near = min(own, key=lambda i: float(np.sum(((library.candidates[i].setting - size) / range_of)[searched] ** 2)))
     copied = max((library.copied(near, size, i) for i, c in enumerate(library.candidates) if c.name != name), default=0)
     return float(case.size * np.sqrt(max(1.0 - copied, 0.0)))

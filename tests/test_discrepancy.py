@@ -26,7 +26,7 @@ from estimator.discrepancy.score import (
     stack,
     white_noise_scale,
 )
-from estimator.effects.declaration import EffectInstance, Parameter
+from estimator.effects.declaration import EffectInstance, Parameter, Search
 from estimator.problem import Problem
 from estimator.residuals import Kernel, KernelResidual, Linearization
 from estimator.solvers import solve
@@ -156,7 +156,7 @@ def test_evidence_is_the_integral_over_the_prior() -> None:
 
 def test_settings_are_the_grid_of_the_searched_parameters() -> None:
     declared = effect(Parameter("size", "1", 1.0, (-1.0, 1.0)),
-                      Parameter("frequency", "Hz", 1.0, (0.0, 9.0), search=(0.1, 10.0, 3, "logarithmic")),
+                      Parameter("frequency", "Hz", 1.0, (0.0, 9.0), search=Search(0.1, 10.0, 3, "logarithmic")),
                       Parameter("time", "s", 1.0, (0.0, 9.0), search=(0.0, 4.0, 5, "linear")))
     grid = np.array(settings(declared))
     assert (grid[:, 0] == 0).all()

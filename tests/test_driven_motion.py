@@ -47,7 +47,7 @@ def values_of(effects):
               INERTIA.name: ENTRIES / ENTRIES[:3].sum(), "inertia_trace": np.array([TRACE]),
               ACTUATOR.name: np.array([0.99, 0.05, -0.03, 0.02]) / np.linalg.norm([0.99, 0.05, -0.03, 0.02])}
     for e in effects:
-        values[e.name] = np.array([np.sqrt(p.search[0] * p.search[1]) if p.search else 0.0 for p in e.parameters])
+        values[e.name] = np.array([p.search.middle() if p.search else 0.0 for p in e.parameters])
     return values
 
 

@@ -178,7 +178,7 @@ def test_every_torque_effect_has_the_sensitivity_of_its_flow(monkeypatch):
               ACTUATOR.name: MOUNT}
     scales = {}
     for e in chosen:
-        values[e.name] = np.array([np.sqrt(p.search[0] * p.search[1]) if p.search else 0.2 * p.scale
+        values[e.name] = np.array([p.search.middle() if p.search else 0.2 * p.scale
                                    for p in e.parameters])
         scales[e.name] = np.array([p.scale for p in e.parameters])
     starts = (Unknown("attitude:a", UnitQuaternion(), "rad", 0.1), Unknown("rate:a", Vector(3), "rad/s", 0.01))

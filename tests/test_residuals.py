@@ -87,7 +87,7 @@ def environment(rng, samples):
 
 def parameters(effects, rng):
     """Values of every effect's parameters, a tenth of a scale from zero (or inside the range where searched)."""
-    return {e.name: np.array([p.search[0] + 0.4 * (p.search[1] - p.search[0]) if p.search
+    return {e.name: np.array([p.search.at(0.4) if p.search
                               else 0.1 * p.scale * rng.uniform(0.5, 1.0) for p in e.parameters]) for e in effects}
 
 

@@ -421,12 +421,11 @@ def settings(effect: EffectInstance) -> list[np.ndarray]:
     for i, p in enumerate(effect.parameters):
         if p.search is None:
             continue
-        low, high, number, kind = p.search
         if first:
-            values = np.geomspace(low, high, number) if kind == "logarithmic" else np.linspace(low, high, number)
+            values = p.search.values()
             index, first = i, False
         else:
-            start[i] = np.sqrt(low * high) if kind == "logarithmic" else 0.5 * (low + high)
+            start[i] = p.search.middle()
     for value in values:
         setting = start.copy()
         if index is not None:

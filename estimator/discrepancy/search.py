@@ -363,15 +363,11 @@ class Workflow:
             for index, parameter in enumerate(self.library[name].parameters):
                 if parameter.search is None:
                     continue
-                low, high, number, kind = parameter.search
-                logarithmic = kind == "logarithmic"
-                span = np.log(high / low) if logarithmic else high - low
-                step = span / max(number - 1, 1) / 2
+                step = 0.5
                 for _ in range(REFINEMENTS):
                     for sign in (-1, 1):
                         moved = setting.copy()
-                        moved[index] = moved[index] * np.exp(sign * step) if logarithmic else moved[index] + sign * step
-                        moved[index] = np.clip(moved[index], *parameter.plausible)
+                        moved[index] = np.clip(parameter.search.moved(moved[index], sign * step), *parameter.plausible)
                         trial = self._trial(name, moved)
                         better, _ = drop(trial)
                         if better > value:

@@ -141,7 +141,7 @@ def _declaration_problems(instance: EffectInstance) -> list[str]:
             problems.append(f"{p.name}: the typical size is not plausible")
         if p.nominal is not None and not low <= p.nominal <= high:
             problems.append(f"{p.name}: the nominal value is not plausible")
-        if p.search is not None and not low <= p.search[0] <= p.search[1] <= high:
+        if p.search is not None and not low <= p.search.low <= p.search.high <= high:
             problems.append(f"{p.name}: the searched values are not plausible")
     return problems
 

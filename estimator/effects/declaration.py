@@ -27,11 +27,52 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
 
 from estimator.models.rotations import Matrix
 
 Channel = Literal["torque", "command", "star_tracker", "doppler", "gnss"]
+
+
+class Search(NamedTuple):
+    """Values to try first of a parameter whose zero carries no direction (a jump's time, a mode's frequency).
+
+    Attributes:
+        low, high: ends of the range, in the parameter's unit.
+        number: of values, both ends among them.
+        spacing: in what measure the steps are even; "square-root" for a frequency, whose neighbours differ by a ratio
+            at the slow end and by the inverse of an arc's length at the fast one.
+    """
+
+    low: float
+    high: float
+    number: int
+    spacing: Literal["linear", "logarithmic", "square-root"]
+
+    def at(self, share: float | np.ndarray) -> Any:
+        """The value that lies a share (0 to 1) of the range above its low end."""
+        measure, back = _SPACINGS[self.spacing]
+        return back(measure(self.low) + share * (measure(self.high) - measure(self.low)))
+
+    def values(self) -> np.ndarray:
+        """All values to try (number,)."""
+        return np.asarray(self.at(np.linspace(0.0, 1.0, self.number)))
+
+    def middle(self) -> float:
+        """The middle of the range."""
+        return float(self.at(0.5))
+
+    def moved(self, value: float, steps: float) -> float:
+        """A value moved by so many steps between neighbours."""
+        measure, back = _SPACINGS[self.spacing]
+        step = (measure(self.high) - measure(self.low)) / max(self.number - 1, 1)
+        return float(back(measure(value) + steps * step))
+
+
+_SPACINGS: dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
+    "linear": (np.asarray, np.asarray), "logarithmic": (np.log, np.exp), "square-root": (np.sqrt, np.square)}
 
 
 @dataclass(frozen=True)
@@ -46,9 +87,8 @@ class Parameter:
         nominal: the value that the physics demands where it is known (1 for the scale of the gravity gradient),
             else None; an estimate that disagrees with it refutes the effect's name.
         search: values to try first where the contribution is nonlinear in this parameter and its zero carries no
-            direction (a jump's time, a mode's frequency): (lowest, highest, number, "linear" | "logarithmic");
-            None for an ordinary parameter. A searched parameter has no zero: the effect vanishes when all the
-            ordinary ones are zero.
+            direction; None for an ordinary parameter. A searched parameter has no zero: the effect vanishes when all
+            the ordinary ones are zero.
     """
 
     name: str
@@ -56,7 +96,7 @@ class Parameter:
     scale: float
     plausible: tuple[float, float]
     nominal: float | None = None
-    search: tuple[float, float, int, Literal["linear", "logarithmic"]] | None = None
+    search: Search | None = None
 
 
 @dataclass(frozen=True)

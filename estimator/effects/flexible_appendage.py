@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import casadi as ca
 
-from estimator.effects.declaration import Parameter, Sample, declare
+from estimator.effects.declaration import Parameter, Sample, Search, declare
 from estimator.models import flexible_mode
 from estimator.models.rotations import Matrix
 from estimator.models.smooth import positive
@@ -30,8 +30,8 @@ EFFECT = declare(
     "flexible-appendage", "torque",
     (*(Parameter(f"coupling_{axis}", "kg m2", 1.0, (0.0, 500.0)) for axis in ("xx", "yy", "zz")),
      *(Parameter(f"coupling_{axis}", "kg m2", 1.0, (-500.0, 500.0)) for axis in ("xy", "xz", "yz")),
-     Parameter("frequency", "Hz", 0.05, (0.005, 1.0), search=(0.01, 0.6, 14, "logarithmic")),
-     Parameter("damping_ratio", "1", 0.01, (0.0, 0.3), search=(0.005, 0.05, 2, "logarithmic"))),
+     Parameter("frequency", "Hz", 0.05, (0.005, 1.0), search=Search(0.01, 0.6, 48, "square-root")),
+     Parameter("damping_ratio", "1", 0.01, (0.0, 0.3), search=Search(0.005, 0.05, 2, "logarithmic"))),
     contribution,
     summary="A vibration mode exchanges momentum with the body. A mode of coupling vector d (kg^1/2 m) has the "
             "coupling matrix d d^T; its six entries are the parameters because d itself has no direction at zero, and "

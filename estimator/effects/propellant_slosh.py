@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import casadi as ca
 
-from estimator.effects.declaration import Parameter, Sample, declare
+from estimator.effects.declaration import Parameter, Sample, Search, declare
 from estimator.models import propellant
 from estimator.models.rotations import Matrix
 from estimator.models.smooth import positive
@@ -30,8 +30,8 @@ EFFECT = declare(
     "propellant-slosh", "torque",
     (*(Parameter(f"moment_{axis}", "kg m2", 1.0, (0.0, 500.0)) for axis in ("xx", "yy", "zz")),
      *(Parameter(f"moment_{axis}", "kg m2", 1.0, (-500.0, 500.0)) for axis in ("xy", "xz", "yz")),
-     Parameter("frequency", "Hz", 0.02, (0.003, 0.5), search=(0.01, 0.25, 8, "logarithmic")),
-     Parameter("damping_ratio", "1", 0.05, (0.0, 1.0), search=(0.02, 0.2, 2, "logarithmic"))),
+     Parameter("frequency", "Hz", 0.02, (0.003, 0.5), search=Search(0.01, 0.25, 24, "square-root")),
+     Parameter("damping_ratio", "1", 0.05, (0.0, 1.0), search=Search(0.02, 0.2, 2, "logarithmic"))),
     contribution,
     summary="A mass m at b in the tank moves on three equal springs with damping. Its parameters are the entries of "
             "the second moment m b b^T about the centre of mass (several tanks of one frequency add up). The "

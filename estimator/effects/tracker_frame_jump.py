@@ -6,7 +6,7 @@ import functools
 
 import casadi as ca
 
-from estimator.effects.declaration import Effect, EffectInstance, Layout, Parameter, Sample, axes, register
+from estimator.effects.declaration import Effect, EffectInstance, Layout, Parameter, Sample, Search, axes, register
 from estimator.models.rotations import Matrix
 
 NAME = "tracker-frame-jump"
@@ -25,7 +25,7 @@ def _instances(layout: Layout) -> tuple[EffectInstance, ...]:
     if last <= first:
         return ()
     edge = (last - first) / (TRIALS + 1)
-    time = Parameter("time", "s", edge, (first, last), search=(first + edge, last - edge, TRIALS, "linear"))
+    time = Parameter("time", "s", edge, (first, last), search=Search(first + edge, last - edge, TRIALS, "linear"))
     return (EffectInstance(NAME, NAME, "star_tracker", (*axes("jump", "rad", 1e-4, 2e-2), time), contribution,
                            zero="jump = 0", reference="definition"),)
 

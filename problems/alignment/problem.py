@@ -500,15 +500,7 @@ def _entries(normalized: np.ndarray) -> np.ndarray:
 
 def _effect_start(effect: EffectInstance) -> np.ndarray:
     """Zero, or the middle of the range where the parameter is searched."""
-    values = []
-    for p in effect.parameters:
-        if p.search is None:
-            values.append(0.0)
-        elif p.search[3] == "logarithmic":
-            values.append(float(np.sqrt(p.search[0] * p.search[1])))
-        else:
-            values.append(0.5 * (p.search[0] + p.search[1]))
-    return np.array(values)
+    return np.array([0.0 if p.search is None else p.search.middle() for p in effect.parameters])
 
 
 def _arc_unknowns(arc: Arc) -> tuple[Unknown, Unknown]:

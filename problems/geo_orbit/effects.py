@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
 
-from estimator.effects.declaration import Parameter, axes
+from estimator.effects.declaration import Parameter, Search, axes
 from estimator.models.errors import RequestError
 from estimator.models.orbit_motion import (
     BURN_MISALIGNMENT,
@@ -251,7 +251,7 @@ def instances(layout: OrbitLayout) -> tuple[OrbitEffect, ...]:
                     "s",
                     max(600.0, (b - a) / 100),
                     (a, b),
-                    search=(a + 0.02 * (b - a), b - 0.02 * (b - a), 40, "linear"),
+                    search=Search(a + 0.02 * (b - a), b - 0.02 * (b - a), 40, "linear"),
                 ),
                 *axes("velocity", "m/s", 0.1, 2000.0, ("radial", "along", "cross")),
             ),

@@ -279,7 +279,7 @@ def effect_unknown(effect: OrbitEffect) -> Unknown:
 
 def effect_start(effect: OrbitEffect) -> np.ndarray:
     """Zero, or the middle of the range where a parameter is searched."""
-    return np.array([0.0 if p.search is None else 0.5 * (p.search[0] + p.search[1]) for p in effect.parameters])
+    return np.array([0.0 if p.search is None else p.search.middle() for p in effect.parameters])
 
 
 def orbit_problem(model: OrbitModel, effects: Sequence[str] = (), *, candidates: Sequence[str] = ()) -> Problem:
