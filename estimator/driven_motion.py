@@ -19,7 +19,8 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 import numpy as np
 
-from estimator.models.compiled import Mapped, compiled
+from estimator.models.compiled import compiled
+from estimator.models.loops import Mapped, Stepped
 from estimator.propagation import Product, PropagatedSignal, tangent_maps
 from estimator.signals import Values
 from estimator.unknowns import Manifold, UnitQuaternion, Unknown
@@ -51,8 +52,7 @@ class Drive:
         function = compiled(self._step(name, inputs, held, derivative, substeps))
         same = (*(f"p{i}" for i in range(len(shared))), "p")  # for all steps of an arc
         self._mapped = None if self.internal else Mapped(function, same)
-        self._function = function
-        self._accumulated: dict[int, ca.Function] = {}
+        self._stepped = Stepped(function, 1, same) if self.internal else None
 
     def _stage(self, name: str, inputs: int, held: int, derivative: RightSide) -> ca.Function:
         """``(outer state, internal state, shared, p, u, held, step, fraction) -> (B, internal derivative)``."""
@@ -123,29 +123,16 @@ class Drive:
             time: (nodes,) s.
         """
         steps = len(time) - 1
+        given = {f"p{i}": q for i, q in enumerate(shared)}
+        given |= {"x0": states[:-1], "x1": states[1:], "p": parameters, "u0": inputs[:-1], "u1": inputs[1:],
+                  "held": held, "dt": np.diff(time)[:, None]}
         if self._mapped is not None:
-            given = {f"p{i}": q for i, q in enumerate(shared)}
-            early, late = self._mapped(steps, x0=states[:-1], x1=states[1:], **given, p=parameters, u0=inputs[:-1],
-                                       u1=inputs[1:], held=held, dt=np.diff(time)[:, None])
-            shape = (steps, self.outer.ambient, self.parameters)
-            return early.reshape(shape), late.reshape(shape)
-        if steps not in self._accumulated:
-            if len(self._accumulated) > 16:
-                self._accumulated.clear()
-            self._accumulated[steps] = self._function.mapaccum("arc", steps, ["z"], ["z_next"])
-        buffer, trigger = self._accumulated[steps].buffer()
-        tiled = [np.broadcast_to(np.asarray(q, dtype=float), (steps, len(q))) for q in (*shared, parameters)]
-        arguments = [np.ascontiguousarray(a, dtype=float) for a in
-                     (np.zeros(self.internal), states[:-1], states[1:], *tiled, inputs[:-1], inputs[1:], held,
-                      np.diff(time))]
-        for i, argument in enumerate(arguments):
-            buffer.set_arg(i, (argument if argument.size else np.zeros(1)).data)
-        after = np.empty((steps, self.internal))
-        early, late = (np.empty((steps, self.parameters, self.outer.ambient)) for _ in range(2))
-        for i, result in enumerate((after, early, late)):
-            buffer.set_res(i, result.data)
-        trigger()
-        return early.transpose(0, 2, 1), late.transpose(0, 2, 1)
+            early, late = (m.reshape(steps, self.outer.ambient, self.parameters) for m in self._mapped(steps, **given))
+            return early, late
+        assert self._stepped is not None
+        _, early, late = self._stepped(steps, [np.zeros(self.internal)], given)
+        shape = (steps, self.parameters, self.outer.ambient)
+        return early.reshape(shape).transpose(0, 2, 1), late.reshape(shape).transpose(0, 2, 1)
 
 
 @dataclass(frozen=True, eq=False)

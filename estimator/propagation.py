@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 
 from estimator.models.compiled import compiled
+from estimator.models.loops import Stepped
 from estimator.signals import Values
 from estimator.unknowns import Manifold, UnitQuaternion, Unknown
 
@@ -113,7 +114,6 @@ class Flow:
         self.columns = column + int(sum(u.manifold.tangent for u in shared))
         self._name, self._sizes, self._substeps = name, (inputs, held), substeps
         self._derivative = derivative
-        self._accumulated: dict[int, ca.Function] = {}
 
     @cached_property
     def _evaluated(self) -> ca.Function:
@@ -123,6 +123,10 @@ class Flow:
     def step(self) -> ca.Function:
         """One compiled step of the state and its sensitivities."""
         return compiled(self._step(f"{self._name}_sensitivity", self._evaluated, *self._sizes, self._substeps, True))
+
+    @cached_property
+    def _stepped(self) -> Stepped:
+        return Stepped(self.step, 2, [f"p{i}" for i in range(len(self.shared))])
 
     @cached_property
     def plain(self) -> ca.Function:
@@ -209,29 +213,11 @@ class Flow:
     def propagate(self, x0: np.ndarray, shared: Sequence[np.ndarray], inputs: np.ndarray, held: np.ndarray,
                   time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """States (nodes, ambient) and sensitivities (nodes, ambient, columns) at the nodes ``time``."""
-        steps = len(time) - 1
-        sensitivity0 = self.initial_sensitivity(x0)
-        states = np.empty((steps + 1, self.manifold.ambient))
-        sensitivities = np.empty((steps + 1, self.columns, self.manifold.ambient))
-        states[0], sensitivities[0] = x0, sensitivity0.T
-        if steps == 0:
-            return states, sensitivities.transpose(0, 2, 1)
-        if steps not in self._accumulated:
-            if len(self._accumulated) > 16:
-                self._accumulated.clear()
-            self._accumulated[steps] = self.step.mapaccum("arc", steps, ["x", "S"], ["x_next", "S_next"])
-        function = self._accumulated[steps]
-        buffer, trigger = function.buffer()
-        tiled = [np.ascontiguousarray(np.broadcast_to(np.asarray(p, dtype=float), (steps, len(p)))) for p in shared]
-        arguments = [np.ascontiguousarray(x0, dtype=float), np.ascontiguousarray(sensitivity0.T), *tiled,
-                     np.ascontiguousarray(inputs[:-1]), np.ascontiguousarray(inputs[1:]), np.ascontiguousarray(held),
-                     np.ascontiguousarray(np.diff(time))]
-        for i, argument in enumerate(arguments):
-            buffer.set_arg(i, (argument if argument.size else np.zeros(1)).data)
-        buffer.set_res(0, states[1:].data)
-        buffer.set_res(1, sensitivities[1:].data)
-        trigger()
-        return states, sensitivities.transpose(0, 2, 1)
+        given = {f"p{i}": p for i, p in enumerate(shared)}
+        given |= {"u0": inputs[:-1], "u1": inputs[1:], "held": held, "dt": np.diff(time)}
+        states, sensitivities = self._stepped(len(time) - 1, [x0, self.initial_sensitivity(x0)], given)
+        shape = (len(time), self.columns, self.manifold.ambient)
+        return states, sensitivities.reshape(shape).transpose(0, 2, 1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,8 @@ import casadi as ca
 import numpy as np
 
 from estimator.losses import Loss, Quadratic
-from estimator.models.compiled import Mapped, compiled
+from estimator.models.compiled import compiled
+from estimator.models.loops import Mapped
 from estimator.signals import Signal, Values
 from estimator.unknowns import Manifold, Unknown
 

@@ -18,7 +18,6 @@ import tempfile
 from pathlib import Path
 
 import casadi as ca
-import numpy as np
 
 _FLAGS = ("-fPIC", "-shared", "-fno-math-errno")
 _OPTIMIZATION = ((25_000, "-O2"), (40_000, "-O1"))
@@ -80,25 +79,46 @@ def compiled(function: ca.Function) -> ca.Function:
 
     Args:
         function: a pure CasADi function without callbacks or solvers inside.
+    """
+    if compiler() is None or cache_directory() is None:
+        return function
+    generator = ca.CodeGenerator("kernel.c", {"with_header": False})
+    generator.add(function)
+    source = generator.dump()
+    library = built(function.name(), source)
+    if library is None:
+        return function
+    made = ca.external(function.name(), str(library))
+    _libraries[hash(made)] = made, library
+    return made
 
-    Two processes that compile the same kernel at once do no harm: each renames a whole library into place.
+
+_libraries: dict[int, tuple[ca.Function, Path]] = {}
+"""Of every compiled function its library, under the identity that CasADi gives it; held, so that it stays unique."""
+
+
+def library_of(function: ca.Function) -> Path | None:
+    """The library of a function that :func:`compiled` made, None for any other."""
+    found = _libraries.get(hash(function))
+    return None if found is None else found[1]
+
+
+def built(name: str, source: str) -> Path | None:
+    """The library of a source in C, from the cache or compiled now; None where it cannot be compiled.
+
+    Two processes that compile the same source at once do no harm: each renames a whole library into place.
     """
     found = compiler()
     directory = cache_directory() if found else None
     if found is None or directory is None:
-        return function
+        return None
     path, version = found
-    with tempfile.TemporaryDirectory(prefix="boresight-") as work:
-        generator = ca.CodeGenerator("kernel.c", {"with_header": False})
-        generator.add(function)
-        source = generator.dump()
-        flags = _flags(source)
-        key = hashlib.sha256(
-            "\n".join([source, version, *flags, ca.__version__, platform.machine(), _processor(),
-                       function.name()]).encode()
-        ).hexdigest()[:32]
-        library = directory / f"{function.name()}-{key}.so"
-        if not library.exists():
+    flags = _flags(source)
+    key = hashlib.sha256("\n".join([source, version, *flags, ca.__version__, platform.machine(), _processor(),
+                                    name]).encode()).hexdigest()[:32]
+    library = directory / f"{name}-{key}.so"
+    if not library.exists():
+        with tempfile.TemporaryDirectory(prefix="boresight-") as work:
             source_file = Path(work) / "kernel.c"
             source_file.write_text(source)
             partial = directory / f".{library.name}.{os.getpid()}"
@@ -106,72 +126,6 @@ def compiled(function: ca.Function) -> ca.Function:
                                     capture_output=True, text=True, check=False)
             if answer.returncode != 0:
                 partial.unlink(missing_ok=True)
-                return function
+                return None
             partial.replace(library)
-        return ca.external(function.name(), str(library))
-
-
-class Mapped:
-    """A kernel applied to many samples in one call, through CasADi's buffer interface (no copies of matrices).
-
-    Args:
-        kernel: the per-sample function; every input and output is made dense.
-        shared: names of the inputs that are the same for all samples (unknowns); all others have one column, or one
-            block of columns, per sample.
-
-    Calling it with arrays of shape (samples, rows, columns), or (samples, rows) for vectors, returns a list of arrays
-    of shape (samples, rows, columns), the last axis dropped for vectors. Shared inputs have no sample axis.
-    """
-
-    def __init__(self, kernel: ca.Function, shared: tuple[str, ...] = ()):
-        self.names = [kernel.name_in(i) for i in range(kernel.n_in())]
-        symbols = [ca.MX.sym(n, *kernel.size_in(i)) for i, n in enumerate(self.names)]
-        outputs = kernel.call(symbols)
-        dense = ca.Function(kernel.name() + "_dense", symbols, [ca.densify(o) for o in outputs], self.names,
-                            [kernel.name_out(i) for i in range(kernel.n_out())])
-        sparse = any(not kernel.sparsity_out(i).is_dense() for i in range(kernel.n_out()))
-        self.kernel = dense if sparse else kernel
-        self.shared = frozenset(shared)
-        self._by_size: dict[int, ca.Function] = {}
-
-    def _function(self, samples: int) -> ca.Function:
-        if samples not in self._by_size:
-            if len(self._by_size) > 32:
-                self._by_size.clear()
-            reduce_in = [i for i, n in enumerate(self.names) if n in self.shared]
-            name = f"{self.kernel.name()}_map{samples}"
-            if reduce_in:
-                self._by_size[samples] = self.kernel.map(name, "serial", samples, reduce_in, [])
-            else:
-                self._by_size[samples] = self.kernel.map(samples, "serial")
-        return self._by_size[samples]
-
-    def __call__(self, samples: int, **inputs: np.ndarray) -> list[np.ndarray]:
-        """Apply the kernel to ``samples`` samples; see the class for shapes."""
-        if samples == 0:
-            return [np.zeros((0, *self._shape(i))) for i in range(self.kernel.n_out())]
-        function = self._function(samples)
-        buffer, trigger = function.buffer()
-        keep = []
-        for i, name in enumerate(self.names):
-            rows, columns = self.kernel.size_in(i)
-            values = np.asarray(inputs[name], dtype=float)
-            if name in self.shared:
-                flat = np.ascontiguousarray(values.reshape(rows, columns).T if columns > 1 else values.reshape(-1))
-            else:
-                full = values.reshape(samples, rows, columns)
-                flat = np.ascontiguousarray(full.transpose(0, 2, 1) if columns > 1 else full)
-            keep.append(flat)
-            buffer.set_arg(i, flat.data)
-        results = []
-        for i in range(self.kernel.n_out()):
-            rows, columns = self.kernel.size_out(i)
-            out = np.zeros((samples, columns, rows))
-            results.append(out)
-            buffer.set_res(i, out.data)
-        trigger()
-        return [r.transpose(0, 2, 1) if r.shape[1] > 1 else r[:, 0, :] for r in results]
-
-    def _shape(self, i: int) -> tuple[int, ...]:
-        rows, columns = self.kernel.size_out(i)
-        return (rows, columns) if columns > 1 else (rows,)
+    return library

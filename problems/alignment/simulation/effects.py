@@ -20,7 +20,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from estimator.effects.declaration import ENVIRONMENT, EffectInstance, Layout, Sample
-from estimator.models.compiled import Mapped
+from estimator.models.loops import Mapped
 from estimator.models.errors import NotFiniteError, RequestError
 from problems.alignment.simulation.orbit import Orbit
 
