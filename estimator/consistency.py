@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.stats import chi2
+
+from estimator.chance import chi2_quantile
 
 ENOUGH = 35  # degrees of freedom below which a normalized sum of squares has little power
 
@@ -55,8 +56,8 @@ def consistency(total: float, degrees: float, level: float = 0.9999) -> Consiste
     """
     if degrees < 1:
         return Consistency(total, degrees, 0.0, float("inf"), level, "not enough data")
-    low = float(chi2.ppf((1 - level) / 2, degrees) / degrees)
-    high = float(chi2.ppf((1 + level) / 2, degrees) / degrees)
+    low = float(chi2_quantile((1 - level) / 2, degrees) / degrees)
+    high = float(chi2_quantile((1 + level) / 2, degrees) / degrees)
     ratio = total / degrees
     verdict: Literal["consistent", "too large", "too small", "not enough data"] = "consistent"
     if ratio > high:

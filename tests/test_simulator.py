@@ -687,7 +687,7 @@ def test_orbit_phase_means_the_same_as_in_the_common_table():
 def test_simulator_shares_no_model_with_the_estimator():
     """Only declarations of effects, the common table of the environment, errors and array plumbing may be imported."""
     allowed = {"estimator.effects.declaration", "estimator.effects.library", "estimator.models.environment",
-               "estimator.models.errors", "estimator.models.compiled"}
+               "estimator.models.errors", "estimator.models.compiled", "estimator.models.loops"}
     files = [*Path(problems.alignment.simulation.__path__[0]).glob("*.py"), Path(simulator.__file__)]
     assert len(files) > 6
     for file in files:

@@ -11,7 +11,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats import chi2
+
+from estimator.chance import chi2_tail
 
 DRAWS = 4000
 
@@ -51,7 +52,7 @@ def effective_looks(gram: np.ndarray, degrees: Sequence[int], places: Sequence[s
     start = 0
     for _, degree in chosen:
         squares = np.sum(samples[:, start : start + degree] ** 2, axis=1)
-        smallest = np.minimum(smallest, chi2.sf(squares, degree))
+        smallest = np.minimum(smallest, chi2_tail(squares, degree))
         start += degree
     level = float(np.quantile(smallest, 0.02))
     return float(max(1.0, np.log1p(-0.02) / np.log1p(-max(level, 1e-12))))

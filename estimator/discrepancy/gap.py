@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
-from scipy.stats import chi2, norm
 
+from estimator.chance import chi2_tail, normal_tail
 from estimator.discrepancy.score import Piece, Stack
 from estimator.problem import Problem
 from estimator.residuals import KernelResidual, Linearization
@@ -146,12 +146,12 @@ def _together(cells: Sequence[_Cell]) -> list[_Cell]:
         components = sorted({c.component for c in mine})
         if len(mine) < 2:
             continue
-        whole = chi2.sf(*_sum(mine))
+        whole = chi2_tail(*_sum(mine))
         for k in components:
             some = [c for c in mine if c.component == k]
             statistic, degrees = _sum(some)
             found.append(_Cell(channel, "", k, sum(c.samples for c in some), some[0].start, some[-1].stop, statistic,
-                               degrees, float(min(chi2.sf(statistic, degrees), whole)),
+                               degrees, float(min(chi2_tail(statistic, degrees), whole)),
                                sum(c.smooth_power for c in some), max(some, key=lambda c: c.smooth_power).dominant,
                                some[0].floor, tests=2, members=tuple(some)))
     return found
@@ -194,7 +194,7 @@ def _kernel_cells(residual: KernelResidual, part: Linearization, stacked: Stack,
             gradient = direct - inner.T @ absorbed
             statistic, degrees = _square(inner, gradient)
             cells.append(_Cell(residual.channel, name, component, len(inside), start, stop, statistic, degrees,
-                               float(chi2.sf(statistic, max(degrees, 1))), float(direct @ direct),
+                               float(chi2_tail(statistic, max(degrees, 1))), float(direct @ direct),
                                int(np.argmax(direct**2)), float(noise[component % len(noise)]),
                                inner=inner, gradient=gradient))
     return cells
@@ -235,7 +235,7 @@ def _position_cells(residual: TrajectoryResidual, part: Linearization) -> list[_
             amounts = smooth.T @ whitened[inside, axis]
             statistic = float(amounts @ amounts)
             cells.append(_Cell("gnss", name, axis, len(inside), start, stop, statistic, SMOOTH,
-                               float(chi2.sf(statistic, SMOOTH)), statistic, int(np.argmax(amounts**2)),
+                               float(chi2_tail(statistic, SMOOTH)), statistic, int(np.argmax(amounts**2)),
                                float(np.sqrt(np.mean(residual.standard_deviation[:, axis] ** 2)))))
     return cells
 
@@ -244,7 +244,7 @@ def _noise_excess(part: Linearization, piece: Piece, residuals: int) -> float:
     """Root mean square of the whitened residual where its sum of squares is improbably large, 1 else."""
     total = float(np.sum(part.weight[:, None] * part.whitened**2))
     degrees = part.measurements - float(np.sum(piece.inner**2))  # its share of the fit's directions
-    if degrees < 1 or chi2.sf(total, degrees) * residuals > LEVEL:
+    if degrees < 1 or chi2_tail(total, degrees) * residuals > LEVEL:
         return 1.0
     return float(np.sqrt(total / degrees))
 
@@ -281,7 +281,7 @@ def _serial_cells(residual: object, part: Linearization, scale: float) -> list[_
         product = float(np.sum(x[1:][pairs] * x[:-1][pairs]))
         z = product / (np.sqrt(count) * spread)
         cells.append(_Cell(residual.channel, label, component, count, float(time[0]), float(time[-1]), z * z, 1,
-                           float(norm.sf(z)), max(product, 0.0), 1, float(floor[component % len(floor)]),
+                           float(normal_tail(z)), max(product, 0.0), 1, float(floor[component % len(floor)]),
                            _correlation_time(x, float(np.median(step[pairs])))))
     return cells
 
@@ -336,7 +336,7 @@ def _periodic_cells(problem: Problem, parts: Sequence[Linearization], stacked: S
                 power[i, k] = 2 * np.abs(np.fft.rfft(spread)[seen]) ** 2 / (len(time) * level)
         samples = sum(len(time) for _, time, _, _ in arcs)
         everywhere = power.sum(axis=(0, 1))
-        common = chi2.sf(everywhere, 2 * len(arcs) * components)
+        common = chi2_tail(everywhere, 2 * len(arcs) * components)
         for k in range(components):
             floor = float(arcs[0][3][k])
             for i, (name, time, _, _) in enumerate(arcs if len(arcs) > 1 else ()):
@@ -344,7 +344,7 @@ def _periodic_cells(problem: Problem, parts: Sequence[Linearization], stacked: S
                 cells.append(_periodic_cell(channel, name, k, time, len(time), power[i, k, top], 2, floor,
                                             frequency[top], number))
             total = power[:, k].sum(axis=0)
-            p_value = chi2.sf(total, 2 * len(arcs))
+            p_value = chi2_tail(total, 2 * len(arcs))
             top = int(np.argmin(np.minimum(p_value, common)))
             whole = np.array([arcs[0][1][0], arcs[-1][1][-1]])
             cell = _periodic_cell(channel, "all arcs" if len(arcs) > 1 else arcs[0][0], k, whole, samples, total[top],
@@ -359,7 +359,7 @@ def _periodic_cells(problem: Problem, parts: Sequence[Linearization], stacked: S
 def _periodic_cell(channel: str, arc: str, component: int, time: np.ndarray, samples: int, power: float, degrees: int,
                    floor: float, frequency: float, tests: int) -> _Cell:
     return _Cell(channel, arc, component, samples, float(time[0]), float(time[-1]), float(power), degrees,
-                 float(chi2.sf(power, degrees)), float(power), 1, floor, 0.5 / float(frequency), tests,
+                 float(chi2_tail(power, degrees)), float(power), 1, floor, 0.5 / float(frequency), tests,
                  1.0 / float(frequency))
 
 

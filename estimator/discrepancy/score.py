@@ -14,8 +14,8 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from scipy.stats import chi2
 
+from estimator.chance import chi2_quantile, chi2_tail, noncentral_chi2_below
 from estimator.effects.declaration import EffectInstance
 from estimator.problem import Problem
 from estimator.residuals import Linearization
@@ -358,9 +358,9 @@ def score_of(stacked: Stack, candidate: Signature, given: Products, number: int)
     evidence = log_evidence(candidate.effect, candidate.ordinary, matrix, -gradient)
     evidence -= float(np.log(len(settings(candidate.effect))))  # the best of so many settings is taken
     typical = float(np.trace(matrix)) / len(scales)
-    power = float(1 - _noncentral(chi2.ppf(0.99, degrees), degrees, typical))
-    return Score(candidate.effect.name, candidate.setting, score, degrees, float(chi2.sf(score, degrees)), size, sigma,
-                 share, _absorbers(stacked, candidate) if share < 1e-3 else (), evidence, power)
+    power = float(1 - noncentral_chi2_below(chi2_quantile(0.99, degrees), degrees, min(typical, 1e4)))
+    return Score(candidate.effect.name, candidate.setting, score, degrees, float(chi2_tail(score, degrees)), size,
+                 sigma, share, _absorbers(stacked, candidate) if share < 1e-3 else (), evidence, power)
 
 
 def log_evidence(effect: EffectInstance, ordinary: np.ndarray, information: np.ndarray, gradient: np.ndarray) -> float:
@@ -388,12 +388,6 @@ def _prior_width(effect: EffectInstance, index: int) -> float:
     if parameter.nominal is not None:
         return 0.02 * abs(parameter.nominal) / parameter.scale
     return 3.0
-
-
-def _noncentral(threshold: float, degrees: int, shift: float) -> float:
-    from scipy.stats import ncx2
-
-    return float(ncx2.cdf(threshold, degrees, min(shift, 1e4)))
 
 
 def _absorbers(stacked: Stack, candidate: Signature) -> tuple[str, ...]:

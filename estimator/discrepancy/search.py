@@ -16,8 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.stats import chi2
 
+from estimator.chance import chi2_tail
 from estimator.discrepancy.combinations import Candidate, LinearLibrary, price, visible_directions
 from estimator.discrepancy.false_alarm import after_search, effective_looks
 from estimator.discrepancy.gap import Gap, find_gap
@@ -357,7 +357,7 @@ class Workflow:
             found = [drop(s) for s in own]
             best = int(np.argmax([d for d, _ in found]))
             value, degrees = found[best]
-            if degrees == 0 or after_search(float(chi2.sf(value, degrees)), self.looks) > WORTH_REFINING:
+            if degrees == 0 or after_search(float(chi2_tail(value, degrees)), self.looks) > WORTH_REFINING:
                 continue
             setting = own[best].setting
             for index, parameter in enumerate(self.library[name].parameters):
@@ -397,7 +397,7 @@ class Workflow:
     def significant(self, drop: float, name: str) -> float:
         """Probability after the search that noise lowers the sum of squares by ``drop`` through this effect."""
         degrees = max(self._degrees.get(name, 1), 1)
-        return after_search(float(chi2.sf(max(drop, 0.0), degrees)), self.looks)
+        return after_search(float(chi2_tail(max(drop, 0.0), degrees)), self.looks)
 
     def pruned(self, here: _Round, chosen: Sequence[int]) -> list[int]:
         """The set without what is not significant beside the rest, the weakest leaving first.
