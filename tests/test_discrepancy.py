@@ -157,7 +157,7 @@ def test_evidence_is_the_integral_over_the_prior() -> None:
 def test_settings_are_the_grid_of_the_searched_parameters() -> None:
     declared = effect(Parameter("size", "1", 1.0, (-1.0, 1.0)),
                       Parameter("frequency", "Hz", 1.0, (0.0, 9.0), search=Search(0.1, 10.0, 3, "logarithmic")),
-                      Parameter("time", "s", 1.0, (0.0, 9.0), search=(0.0, 4.0, 5, "linear")))
+                      Parameter("time", "s", 1.0, (0.0, 9.0), search=Search(0.0, 4.0, 5, "linear")))
     grid = np.array(settings(declared))
     assert (grid[:, 0] == 0).all()
     np.testing.assert_allclose(np.unique(grid[:, 1]), [0.1, 1.0, 10.0])

@@ -50,6 +50,7 @@ RIVALS = 5  # names that are refitted in the place of an accepted one
 TURNS = 16  # sets that are refitted before the search stops
 ALIKE = 0.5  # part of an effect's squared signature that a name must copy for others to change with it
 REFUSALS = 4  # sets in a row that a joint fit did not bear out before the search stops
+ANSWERS = (0, -1, -2, -3.5, -5)  # steps between settings by which a mode may be seen above its own frequency
 LINEAR = 0.03  # part of a drop that the linear model may be wrong by
 
 Say = Callable[[str], None]
@@ -190,7 +191,7 @@ class Workflow:
             start = {**near.estimate.values, **(sizes or {})}
             known = {n: np.asarray(start[n]) for n, v in problem.start.items()
                      if n in start and np.shape(start[n]) == np.shape(v)}
-            problem = problem.starting_at(known)
+            problem = self._answering(problem.starting_at(known), set(key) - set(near.effects))
             gone = set(near.effects) - set(key)
             values = _polished(problem, {u.name for u in problem.unknowns} if gone else set(key) - set(near.effects))
             prepared = problem.prepared(values)
@@ -203,6 +204,30 @@ class Workflow:
         fit = Refit(key, estimate, float(cost))
         self._fits[key] = fit
         return fit
+
+    def _answering(self, problem: Problem, newcomers: Collection[str]) -> Problem:
+        """The problem started where an effect with internal states answers best.
+
+        A mode that carries much of the inertia is seen well above its own frequency, and its signature, which is that
+        of a small mode, knows only where it is seen: the searched parameter is moved by steps of its grid.
+        """
+        for name in sorted(newcomers):
+            effect = self.library[name]
+            index = next((i for i, p in enumerate(effect.parameters) if p.search is not None), None)
+            if not effect.state_size or index is None or all(u.name != name for u in problem.unknowns):
+                continue
+            parameter = effect.parameters[index]
+            assert parameter.search is not None
+            touched = problem.with_residuals([r for r in problem.residuals if any(u.name == name for u in r.unknowns)])
+            found = []
+            for steps in ANSWERS:
+                setting = np.array(problem.start[name], dtype=float)
+                setting[index] = np.clip(parameter.search.moved(setting[index], steps), *parameter.plausible)
+                values = _polished(touched.starting_at({name: setting}), {name}, iterations=2)
+                cost = sum(p.cost for p in touched.prepared(values).linearize(values, (name,)))
+                found.append((cost, setting))
+            problem = problem.starting_at({name: min(found, key=lambda f: f[0])[1]})
+        return problem
 
     def worth(self, fit: Refit) -> float:
         """Half the drop of the sum of squares from the plain fit, less the prices of the effects.
@@ -425,21 +450,28 @@ class Workflow:
         """The set of effects worth most, reached from ``accepted`` by joint refits."""
         refused: set[frozenset[str]] = set()
         in_a_row = 0
+        out_of_place = set(excluded)  # with names whose size came out implausible beside the accepted ones
         for _ in range(TURNS):
             here = self.round(accepted)
             library = here.library
-            chosen = self.pruned(here, library.best(here.members, excluded, MOST_EFFECTS, refused))
+            found = library.best(here.members, out_of_place, MOST_EFFECTS, refused)
+            chosen = self.pruned(here, found)
             names = frozenset(library.candidates[i].name for i in chosen)
-            if names == set(accepted) or names in refused or in_a_row == REFUSALS:
+            if names == set(accepted) or in_a_row == REFUSALS:
                 return accepted
+            if names in refused:  # what was pruned led back there: look elsewhere
+                refused.add(frozenset(library.candidates[i].name for i in found))
+                in_a_row += 1
+                continue
             self.say("joint fit with " + (", ".join(sorted(names)) or "nothing"))
             refit = self.fit(sorted(names), here.fit, self.sizes_of(here, chosen))
-            sound = all(self.plausible(n, refit) for n in names)
-            if sound and self.worth(refit) > self.worth(here.fit) + 1e-3:
-                accepted, in_a_row = refit.effects, 0
+            implausible = {n for n in names if not self.plausible(n, refit)}
+            if not implausible and self.worth(refit) > self.worth(here.fit) + 1e-3:
+                accepted, in_a_row, out_of_place = refit.effects, 0, set(excluded)
             else:
                 refused.add(names)
                 in_a_row += 1
+                out_of_place |= implausible - set(accepted)
         return accepted
 
     def needed(self, effects: tuple[str, ...]) -> tuple[str, ...]:
@@ -638,7 +670,7 @@ class Workflow:
         return tuple(findings)
 
 
-def _polished(problem: Problem, names: set[str]) -> dict[str, np.ndarray]:
+def _polished(problem: Problem, names: set[str], iterations: int = 12) -> dict[str, np.ndarray]:
     """Values with the named unknowns, and all that is connected to them through residuals, at their optimum."""
     free = {u.name for u in problem.free}
     reached = names & free
@@ -650,7 +682,7 @@ def _polished(problem: Problem, names: set[str]) -> dict[str, np.ndarray]:
         growing = grown != reached
         reached = grown
     part = problem.with_residuals(touched).holding(*(free - reached))
-    estimate = solve(part, Options(tolerance=3e-2, iterations=12, largest_step=1e4))
+    estimate = solve(part, Options(tolerance=3e-2, iterations=iterations, largest_step=1e4))
     return dict(estimate.values)
 
 
