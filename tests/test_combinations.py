@@ -15,14 +15,14 @@ from estimator.discrepancy.combinations import (
     price,
     visible_directions,
 )
-from estimator.effects.declaration import EffectInstance, Parameter
+from estimator.effects.declaration import EffectInstance, Parameter, Search
 
 
 def effect(name: str, count: int, *, nominal: float | None = None, low: float = -1e4, high: float = 1e4,
            search: bool = False) -> EffectInstance:
     parameters = [Parameter(f"p{i}", "1", 1.0, (low, high), nominal=nominal) for i in range(count)]
     if search:
-        parameters.append(Parameter("time", "s", 1.0, (0.0, 9.0), search=(1.0, 8.0, 4, "linear")))
+        parameters.append(Parameter("time", "s", 1.0, (0.0, 9.0), search=Search(1.0, 8.0, 4, "linear")))
     return EffectInstance(name, name, "doppler", tuple(parameters), lambda sample, p: p, "p = 0", "none")
 
 

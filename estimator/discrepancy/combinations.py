@@ -119,6 +119,7 @@ class LinearLibrary:
     def __init__(self, candidates: Sequence[Candidate], gram: np.ndarray, right: np.ndarray):
         self.candidates = tuple(candidates)
         self._gram, self._right = gram, right
+        self._prices = [price(c.effect, c.degrees) for c in self.candidates]
         total = sum(c.degrees for c in candidates)
         change = np.zeros((len(gram), total))
         self._places: list[np.ndarray] = []
@@ -181,7 +182,7 @@ class LinearLibrary:
             sizes[i] = value
         for i in fixed:
             sizes[i] = np.array([p.nominal or 0.0 for p in self.candidates[i].effect.parameters])
-        cost = sum(price(self.candidates[i].effect, self.candidates[i].degrees) for i in chosen)
+        cost = sum(self._prices[i] for i in chosen)
         return Explained(2 * half, half - cost, tuple(sizes[i] for i in chosen), bool(plausible))
 
     def worth(self, chosen: Collection[int]) -> float:

@@ -276,7 +276,8 @@ def signature(stacked: Stack, problem: Problem, parts: Sequence[Linearization], 
 
 def on_rows(candidate: Signature, stacked: Stack) -> Signature:
     """The same signature on the rows of another stack; residuals are matched by name."""
-    parts = {name: part / stacked.scale[name] for name, part in candidate.parts.items() if name in stacked.blocks}
+    parts = {name: part if stacked.scale[name] == 1 else part / stacked.scale[name]
+             for name, part in candidate.parts.items() if name in stacked.blocks}
     return Signature(candidate.effect, candidate.setting, candidate.ordinary, parts, stacked.blocks)
 
 
@@ -297,15 +298,16 @@ class Products:
     against: np.ndarray
 
 
-def products(stacked: Stack, signatures: Sequence[Signature], right: np.ndarray) -> Products:
+def products(stacked: Stack, signatures: Sequence[Signature], right: np.ndarray,
+             absorbed: np.ndarray | None = None) -> Products:
     """Products of signatures with each other and with ``right`` (rows, k), the fit's columns projected out.
 
     With Q the orthonormal columns of the fit, what is left of columns B has the products ``B'B - (Q'B)'(Q'B)``: a
-    visible part of 1e-8 of the square is right to 1e-7.
+    visible part of 1e-8 of the square is right to 1e-7. ``absorbed`` is ``Q'right`` where it is known already.
     """
     edges = np.cumsum([0, *(len(s.ordinary) for s in signatures)])
     raw, direct = np.zeros((edges[-1], edges[-1])), np.zeros((edges[-1], right.shape[1]))
-    absorbed = stacked.carried(right)
+    absorbed = stacked.carried(right) if absorbed is None else absorbed
     carried = np.zeros((len(absorbed), edges[-1]))
     for name, piece in stacked.pieces.items():
         touching = [(np.arange(a, b), s.parts[name]) for s, (a, b) in zip(signatures, pairwise(edges), strict=True)
@@ -313,7 +315,7 @@ def products(stacked: Stack, signatures: Sequence[Signature], right: np.ndarray)
         if not touching:
             continue
         index = np.concatenate([place for place, _ in touching])
-        columns = np.concatenate([part for _, part in touching], axis=1)
+        columns = np.concatenate([part for _, part in touching], axis=1) if len(touching) > 1 else touching[0][1]
         raw[np.ix_(index, index)] += columns.T @ columns
         carried[:, index] += piece.inner.T @ (piece.span.T @ columns)
         direct[index] += columns.T @ right[piece.rows]

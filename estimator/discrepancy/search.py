@@ -369,9 +369,10 @@ class Workflow:
         """Add settings between those of the grid where the residuals speak for an effect: a lightly damped mode or a
         jump is seen only close to its frequency or time."""
         now = stacked.projected(stacked.residual)[:, None]
+        absorbed = base.carried(now)
 
         def drop(trial: Signature) -> tuple[float, int]:
-            found = products(base, (on_rows(trial, base),), now)
+            found = products(base, (on_rows(trial, base),), now, absorbed)
             seen = visible_directions(found.raw, found.left)
             return float(np.sum((seen.T @ found.against) ** 2)), seen.shape[1]
 
