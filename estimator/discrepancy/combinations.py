@@ -107,6 +107,31 @@ class Explained:
     plausible: bool
 
 
+@dataclass(frozen=True, eq=False)
+class _Solution:
+    """The linear solution of a set: the candidates with free sizes and those that physics fixes, half the drop, the
+    worth, and the eigenvalues, eigenvectors and products with them of the free ones' visible directions."""
+
+    free: list[int]
+    fixed: list[int]
+    half: float
+    worth: float
+    eigenvalues: np.ndarray
+    vectors: np.ndarray
+    along: np.ndarray
+
+
+class _Limits:
+    """Scales (k,) of a candidate's columns, and which of them are ordinary parameters, with their plausible range."""
+
+    def __init__(self, candidate: Candidate):
+        parameters = candidate.effect.parameters
+        self.scales = candidate.scales
+        self.ordinary = np.array([parameters[k].search is None for k in candidate.parameters], dtype=bool)
+        self.parameters = np.asarray(candidate.parameters, dtype=int)[self.ordinary]
+        self.low, self.high = (np.array([parameters[k].plausible[end] for k in self.parameters]) for end in (0, 1))
+
+
 class LinearLibrary:
     """The residuals around one fit as a linear model of the library.
 
@@ -119,6 +144,7 @@ class LinearLibrary:
     def __init__(self, candidates: Sequence[Candidate], gram: np.ndarray, right: np.ndarray):
         self.candidates = tuple(candidates)
         self._gram, self._right = gram, right
+        self._limits = [_Limits(c) for c in self.candidates]
         self._prices = [price(c.effect, c.degrees) for c in self.candidates]
         total = sum(c.degrees for c in candidates)
         change = np.zeros((len(gram), total))
@@ -140,15 +166,12 @@ class LinearLibrary:
         """Candidates of that name."""
         return [i for i, c in enumerate(self.candidates) if c.name == name]
 
-    def explained(self, chosen: Collection[int]) -> Explained:
-        """What the candidates ``chosen`` (indices) explain together."""
-        chosen = list(chosen)
-        if not chosen:
-            return Explained(0.0, 0.0, (), True)
+    def _solved(self, chosen: Sequence[int]) -> _Solution:
+        """The amounts of the visible directions of a set that lower the sum of squares most."""
         fixed = [i for i in chosen if self.candidates[i].nominal is not None]
         free = [i for i in chosen if self.candidates[i].nominal is None]
         half = 0.0
-        place = np.concatenate([np.zeros(0, dtype=int), *(self._places[i] for i in free)])
+        place = np.concatenate([self._places[i] for i in free]) if free else np.zeros(0, dtype=int)
         product = self._product[place]
         if fixed:
             columns = np.concatenate([self.candidates[i].columns for i in fixed])
@@ -156,39 +179,54 @@ class LinearLibrary:
             half += float(self._right[columns] @ amounts)
             half -= 0.5 * float(amounts @ self._gram[np.ix_(columns, columns)] @ amounts)
             product = product - self._across[np.ix_(columns, place)].T @ amounts
-        steps, spread = np.zeros(len(place)), np.zeros((len(place), len(place)))
+        eigenvalues, vectors = np.zeros(0), np.zeros((len(place), 0))
         if len(place):
-            eigenvalues, vectors = np.linalg.eigh(self._regular[np.ix_(place, place)])
-            kept = eigenvalues > COLLINEAR
-            along = vectors[:, kept].T @ product
-            half += 0.5 * float(np.sum(along**2 / eigenvalues[kept]))
-            steps = vectors[:, kept] @ (along / eigenvalues[kept])
-            spread = (vectors[:, kept] / eigenvalues[kept]) @ vectors[:, kept].T
+            eigenvalues, vectors = np.linalg.eigh(self._regular[place[:, None], place])
+            if eigenvalues[0] <= COLLINEAR:
+                kept = eigenvalues > COLLINEAR
+                eigenvalues, vectors = eigenvalues[kept], vectors[:, kept]
+        along = vectors.T @ product
+        half += 0.5 * float(np.sum(along**2 / eigenvalues))
+        return _Solution(free, fixed, half, half - sum(self._prices[i] for i in chosen), eigenvalues, vectors, along)
+
+    def explained(self, chosen: Collection[int]) -> Explained:
+        """What the candidates ``chosen`` (indices) explain together."""
+        chosen = list(chosen)
+        return self._told(chosen, self._solved(chosen)) if chosen else Explained(0.0, 0.0, (), True)
+
+    def _told(self, chosen: Sequence[int], solution: _Solution) -> Explained:
+        steps = solution.vectors @ (solution.along / solution.eigenvalues)
+        spread = (solution.vectors / solution.eigenvalues) @ solution.vectors.T
         sizes, plausible = {}, True
         start = 0
-        for i in free:
-            c = self.candidates[i]
+        for i in solution.free:
+            c, limits = self.candidates[i], self._limits[i]
             inside = slice(start, start + c.degrees)
             start += c.degrees
+            moved = ((c.visible @ steps[inside]) * limits.scales)[limits.ordinary]
+            variance = np.diag(c.visible @ spread[inside, inside] @ c.visible.T)
+            sigma = (np.sqrt(np.maximum(variance, 0.0)) * limits.scales)[limits.ordinary]
+            room = np.minimum(MARGIN * sigma, 0.125 * (limits.high - limits.low)) + CURVED * np.abs(moved)
+            plausible &= bool(np.all((moved >= limits.low - room) & (moved <= limits.high + room)))
             value = np.array(c.setting, dtype=float)
-            ordinary = np.array([c.effect.parameters[k].search is None for k in c.parameters])
-            moved = (c.visible @ steps[inside]) * c.scales
-            sigma = np.sqrt(np.maximum(np.diag(c.visible @ spread[inside, inside] @ c.visible.T), 0.0)) * c.scales
-            value[c.parameters[ordinary]] = moved[ordinary]
-            for k, v, s in zip(c.parameters[ordinary], moved[ordinary], sigma[ordinary], strict=True):
-                low, high = c.effect.parameters[k].plausible
-                room = min(MARGIN * s, 0.125 * (high - low)) + CURVED * abs(v)
-                plausible &= low - room <= v <= high + room
+            value[limits.parameters] = moved
             sizes[i] = value
-        for i in fixed:
+        for i in solution.fixed:
             sizes[i] = np.array([p.nominal or 0.0 for p in self.candidates[i].effect.parameters])
-        cost = sum(self._prices[i] for i in chosen)
-        return Explained(2 * half, half - cost, tuple(sizes[i] for i in chosen), bool(plausible))
+        return Explained(2 * solution.half, solution.worth, tuple(sizes[i] for i in chosen), plausible)
 
-    def worth(self, chosen: Collection[int]) -> float:
-        """Worth of a set; minus infinity where a size is implausible."""
-        found = self.explained(chosen)
-        return found.worth if found.plausible else -np.inf
+    def worth(self, chosen: Collection[int], above: float = -np.inf) -> float:
+        """Worth of a set; minus infinity where a size is implausible.
+
+        Whether sizes are plausible is looked at only where the worth is more than ``above``.
+        """
+        chosen = list(chosen)
+        if not chosen:
+            return 0.0
+        solution = self._solved(chosen)
+        if solution.worth > above and not self._told(chosen, solution).plausible:
+            return -np.inf
+        return solution.worth
 
     def best_setting(self, chosen: Collection[int], name: str) -> int | None:
         """The candidate of that name that explains most beside ``chosen``; None where none is visible."""
@@ -197,7 +235,7 @@ class LinearLibrary:
             return None
         if len(own) == 1:
             return own[0]
-        return max(own, key=lambda i: self.explained((*chosen, i)).drop)
+        return max(own, key=lambda i: self._solved((*chosen, i)).half)
 
     def names(self) -> list[str]:
         """Names with a visible candidate, in order."""
@@ -262,7 +300,7 @@ class LinearLibrary:
                     setting = self.best_setting(kept, name)
                     if setting is None:
                         continue
-                    value = self.worth([setting, *kept])
+                    value = self.worth([setting, *kept], above=worth)
                     if value > worth + 1e-6:
                         best, worth, growing = [setting, *kept], value, True
                         break
@@ -280,7 +318,7 @@ class LinearLibrary:
 
         def look(chosen: list[int]) -> None:
             nonlocal best, best_worth
-            value = self.worth(chosen)
+            value = self.worth(chosen, above=best_worth)
             if value > best_worth and self._names(chosen) not in refused:
                 best, best_worth = chosen, value
 
