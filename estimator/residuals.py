@@ -248,7 +248,7 @@ class KernelResidual:
             residual = residual - self.offset
         columns = tuple(u for u in self.unknowns if only is None or u.name in only)
         width = {u.name: u.manifold.tangent for u in columns}
-        starts = dict(zip(width, np.concatenate([[0], np.cumsum(list(width.values()))[:-1]]).astype(int), strict=True))
+        starts = dict(zip(width, np.cumsum([0, *width.values()]), strict=False))
         jacobian = np.empty((self.samples, self.kernel.size, sum(width.values())))
         written: set[str] = set()
 

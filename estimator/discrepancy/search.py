@@ -50,7 +50,8 @@ RIVALS = 5  # names that are refitted in the place of an accepted one
 TURNS = 16  # sets that are refitted before the search stops
 ALIKE = 0.5  # part of an effect's squared signature that a name must copy for others to change with it
 REFUSALS = 4  # sets in a row that a joint fit did not bear out before the search stops
-ANSWERS = (0, -1, -2, -3.5, -5)  # steps between settings by which a mode may be seen above its own frequency
+ANSWERS = (-1, -2, -3.5, -5)  # steps between settings by which a mode may be seen above its own frequency
+SHORT_OF = 0.85  # part of the drop that the linear model promises below which a mode is started elsewhere too
 LINEAR = 0.03  # part of a drop that the linear model may be wrong by
 
 Say = Callable[[str], None]
@@ -171,7 +172,7 @@ class Workflow:
     # ------------------------------------------------------------------------------------------------ fits
 
     def fit(self, effects: Sequence[str], near: Refit | None = None,
-            sizes: Mapping[str, np.ndarray] | None = None) -> Refit:
+            sizes: Mapping[str, np.ndarray] | None = None, promised: float | None = None) -> Refit:
         """The joint fit of the training data with these effects (kept once made).
 
         Args:
@@ -179,6 +180,8 @@ class Workflow:
             near: a neighbouring fit to start from, the plain one without. Where it lacks some of the effects and has no
                 others, only the part of the problem that the newcomers touch is solved, the rest being at its optimum.
             sizes: where to start the parameters of newcomers.
+            promised: drop of the sum of squares from the plain fit that the linear model expects; where the fit falls
+                short of it, modes are started elsewhere too.
         """
         key = tuple(sorted(effects))
         if key in self._fits:
@@ -191,19 +194,32 @@ class Workflow:
             start = {**near.estimate.values, **(sizes or {})}
             known = {n: np.asarray(start[n]) for n, v in problem.start.items()
                      if n in start and np.shape(start[n]) == np.shape(v)}
-            problem = self._answering(problem.starting_at(known), set(key) - set(near.effects))
-            gone = set(near.effects) - set(key)
-            values = _polished(problem, {u.name for u in problem.unknowns} if gone else set(key) - set(near.effects))
+            problem = problem.starting_at(known)
+            newcomers, gone = set(key) - set(near.effects), set(near.effects) - set(key)
+            names = {u.name for u in problem.unknowns} if gone else newcomers
+            values = _polished(problem, names)
+            if promised is not None and self.fit(()).cost - self._cost(problem, values) < SHORT_OF * promised:
+                again = self._answering(problem, newcomers)
+                if again is not problem:
+                    other = _polished(again, names)
+                    values = min(values, other, key=lambda v: self._cost(problem, v))
             prepared = problem.prepared(values)
             estimate = summarized(prepared, values, prepared.linearize(values), converged=True, reason="",
                                   iterations=0, solver="gauss-newton", seconds=0.0)
         if not self._fits:
             self._noise = dict(stack(estimate.problem, estimate.parts).scale)
-        cost = sum(p.cost / self._noise.get(r.name, 1.0) ** 2
-                   for r, p in zip(estimate.problem.residuals, estimate.parts, strict=True))
-        fit = Refit(key, estimate, float(cost))
+        fit = Refit(key, estimate, self._sum_of(estimate.problem, estimate.parts))
         self._fits[key] = fit
         return fit
+
+    def _sum_of(self, problem: Problem, parts: Sequence[Linearization]) -> float:
+        return float(sum(p.cost / self._noise.get(r.name, 1.0) ** 2
+                         for r, p in zip(problem.residuals, parts, strict=True)))
+
+    def _cost(self, problem: Problem, values: Mapping[str, np.ndarray]) -> float:
+        """Sum of the losses, as that of a :class:`Refit`, at values that need not be a minimum."""
+        prepared = problem.prepared(values)
+        return self._sum_of(prepared, prepared.linearize(values, ()))
 
     def _answering(self, problem: Problem, newcomers: Collection[str]) -> Problem:
         """The problem started where an effect with internal states answers best.
@@ -224,7 +240,7 @@ class Workflow:
                 setting = np.array(problem.start[name], dtype=float)
                 setting[index] = np.clip(parameter.search.moved(setting[index], steps), *parameter.plausible)
                 values = _polished(touched.starting_at({name: setting}), {name}, iterations=2)
-                cost = sum(p.cost for p in touched.prepared(values).linearize(values, (name,)))
+                cost = sum(p.cost for p in touched.prepared(values).linearize(values, ()))
                 found.append((cost, setting))
             problem = problem.starting_at({name: min(found, key=lambda f: f[0])[1]})
         return problem
@@ -465,7 +481,7 @@ class Workflow:
                 in_a_row += 1
                 continue
             self.say("joint fit with " + (", ".join(sorted(names)) or "nothing"))
-            refit = self.fit(sorted(names), here.fit, self.sizes_of(here, chosen))
+            refit = self.fit(sorted(names), here.fit, self.sizes_of(here, chosen), library.explained(chosen).drop)
             implausible = {n for n in names if not self.plausible(n, refit)}
             if not implausible and self.worth(refit) > self.worth(here.fit) + 1e-3:
                 accepted, in_a_row, out_of_place = refit.effects, 0, set(excluded)
@@ -521,11 +537,11 @@ class Workflow:
             tried = library.explained(chosen)
             if tried.plausible and tried.worth > full.worth - room and \
                     self.significant(loss + tried.drop - full.drop, other) < SIGNIFICANT:
-                found.append((tried.worth, other, chosen))
+                found.append((tried.worth, other, chosen, tried.drop))
         fits = []
-        for _, other, chosen in sorted(found, reverse=True)[:RIVALS]:
+        for _, other, chosen, drop in sorted(found, reverse=True)[:RIVALS]:
             self.say(f"{other} in place of {name}?")
-            refit = self.fit([library.candidates[i].name for i in chosen], here.fit, self.sizes_of(here, chosen))
+            refit = self.fit([library.candidates[i].name for i in chosen], here.fit, self.sizes_of(here, chosen), drop)
             if all(self.plausible(n, refit) for n in refit.effects if n not in effects):
                 fits.append((other, refit))
         return fits

@@ -87,6 +87,7 @@ class OrbitEffect:
     zero: str = ""
     reference: str = ""
     each: tuple[str, ...] = ()
+    state_size: int = 0  # an orbit effect has no internal states
 
 
 _ALL = ("range", "range_rate", "azimuth_elevation", "direction_cosines")
