@@ -1,7 +1,7 @@
 """How often ``boresight explain`` is right: hidden effects of known size on campaigns of our own simulator.
 
     python -m benchmarks.explain_study [--out FILE.jsonl] [--workers 2] [--kinds quiet,one,two,outside] [--seeds 10]
-                                       [--sizes 3,5,8,15] [--quiet 300] [--two 100] [--outside 60] [--rivals]
+                                       [--sizes 3,5,8,15] [--quiet 300] [--two 100] [--outside 60] [--rivals 3]
     python -m benchmarks.explain_study --report [--out FILE.jsonl] [--page docs/explain_study.md]
 
 Every case is one compact campaign (all channels, about an hour) with its own orbit, mounting, inertia, attitudes and
@@ -518,7 +518,7 @@ def study(arguments: argparse.Namespace) -> None:
                 case = next(todo, None)
                 if case is None:
                     break
-                running.add(pool.submit(run, case, arguments.rivals))
+                running.add(pool.submit(run, case, arguments.rivals > 0 and case.seed % arguments.rivals == 0))
             if not running:
                 break
             finished, running = wait(running, return_when=FIRST_COMPLETED)
@@ -778,7 +778,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--outside", type=int, default=60)
     parser.add_argument("--most", type=int, default=None, help="stop after this many new campaigns")
     parser.add_argument("--minutes", type=float, default=1e6, help="start no campaign after this long")
-    parser.add_argument("--rivals", action="store_true")
+    parser.add_argument("--rivals", type=int, default=0, help="show the rivals every so-manieth campaign; 0 for none")
     parser.add_argument("--report", action="store_true", help="tables and pictures of what is done")
     parser.add_argument("--page", type=Path, default=None, help="documentation page to write with the report")
     chosen = parser.parse_args(arguments)
