@@ -11,7 +11,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import binom, chi2
 
-from estimator.discrepancy.false_alarm import after_search, effective_looks
+from estimator.discrepancy.false_alarm import Looks, after_search, counted_looks
 from estimator.discrepancy.gap import find_gap
 from estimator.discrepancy.proof import _prediction, misfit, pays, shifts
 from estimator.discrepancy.score import (
@@ -168,11 +168,12 @@ def test_settings_are_the_grid_of_the_searched_parameters() -> None:
 # ---------------------------------------------------------------------------------------------------- false alarms
 
 
-def looks_of(blocks: list[np.ndarray]) -> float:
+def looks_of(blocks: list[np.ndarray], names: list[str] | None = None) -> Looks:
     together = np.concatenate(blocks, axis=1)
     degrees = [b.shape[1] for b in blocks]
     ends = np.cumsum([0, *degrees])
-    return effective_looks(together.T @ together, degrees, [slice(a, b) for a, b in pairwise(ends)])
+    return counted_looks(together.T @ together, degrees, [slice(a, b) for a, b in pairwise(ends)],
+                         names or [str(k) for k in range(len(blocks))])
 
 
 def test_looks_make_the_simulated_search_keep_its_level() -> None:
@@ -181,7 +182,7 @@ def test_looks_make_the_simulated_search_keep_its_level() -> None:
     common = draw.standard_normal((60, 4))
     blocks = [common[:, : 1 + k % 3] + 0.5 * draw.standard_normal((60, 1 + k % 3)) for k in range(12)]
     blocks += [draw.standard_normal((60, 2)) for _ in range(6)]
-    looks = looks_of(blocks)
+    looks = looks_of(blocks).names
     assert 3 < looks < len(blocks) * 1.3
     bases = [np.linalg.qr(b)[0] for b in blocks]
     trials = 6000
@@ -195,12 +196,31 @@ def test_looks_make_the_simulated_search_keep_its_level() -> None:
 
 def test_one_candidate_is_one_look_and_many_independent_ones_are_many() -> None:
     basis = np.eye(80)
-    assert looks_of([basis[:, :1]]) == pytest.approx(1.0, rel=0.3)
-    many = looks_of([basis[:, k : k + 1] for k in range(80)])
+    assert looks_of([basis[:, :1]]).names == pytest.approx(1.0, rel=0.3)
+    many = looks_of([basis[:, k : k + 1] for k in range(80)]).names
     assert many == pytest.approx(80, rel=0.25)
-    copies = looks_of([basis[:, :1] for _ in range(80)])
+    copies = looks_of([basis[:, :1] for _ in range(80)]).names
     assert copies == pytest.approx(1.0, rel=0.3)
-    assert effective_looks(np.zeros((0, 0)), [], []) == 1.0
+    assert counted_looks(np.zeros((0, 0)), [], [], []) == Looks()
+
+
+def test_settings_share_the_level_of_their_name() -> None:
+    """One name at 60 settings beside three of one each: the whole keeps its level, the three pay for four names."""
+    draw = np.random.default_rng(4)
+    blocks = [draw.standard_normal((80, 2)) for _ in range(63)]
+    names = ["mode"] * 60 + ["a", "b", "c"]
+    looks = looks_of(blocks, names)
+    assert looks.names == pytest.approx(4, rel=0.2)
+    assert looks.own["mode"] == pytest.approx(60, rel=0.25) and set(looks.own) == {"mode"}
+    assert looks.after(1e-3, "a") == pytest.approx(4e-3, rel=0.2)
+    assert looks.after(1e-5, "mode") == pytest.approx(2.4e-3, rel=0.35)
+    trials = 6000
+    noise = draw.standard_normal((trials, 80))
+    p_values = np.array([chi2.sf(np.sum((noise @ np.linalg.qr(b)[0]) ** 2, axis=1), 2) for b in blocks])
+    alarms = sum(min(looks.after(float(p), n) for p, n in zip(column, names, strict=True)) < 0.01
+                 for column in p_values.T)
+    low, high = binom.ppf([0.0005, 0.9995], trials, 0.01)
+    assert 0.8 * low <= alarms <= 1.2 * high
 
 
 def test_probability_after_the_search() -> None:

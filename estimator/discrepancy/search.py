@@ -19,7 +19,7 @@ from scipy.optimize import linear_sum_assignment
 
 from estimator.chance import chi2_tail
 from estimator.discrepancy.combinations import Candidate, LinearLibrary, price, visible_directions
-from estimator.discrepancy.false_alarm import after_search, effective_looks
+from estimator.discrepancy.false_alarm import Looks, counted_looks
 from estimator.discrepancy.gap import Gap, find_gap
 from estimator.discrepancy.proof import HeldOut, channels_of, misfit, pays, shifts
 from estimator.discrepancy.score import (
@@ -114,7 +114,7 @@ class Findings:
         tables: the score table of each round.
         plain, final: joint estimates of all data without and with the effects.
         rejected: names that were significant and did not pay on held-out data.
-        looks: independent looks that one search of the library amounts to.
+        looks: independent names that one search of the library amounts to, each at the best of its settings.
         seconds: wall time.
     """
 
@@ -161,7 +161,7 @@ class Workflow:
         self.subject = subject
         self.say = say or (lambda text: None)
         self.library = {e.name: e for e in subject.library}
-        self.looks = 1.0
+        self.looks = Looks()
         self._fits: dict[tuple[str, ...], Refit] = {}
         self._rounds: dict[tuple[str, ...], _Round] = {}
         self._searched: list[Signature] | None = None
@@ -304,7 +304,7 @@ class Workflow:
         self.say("rate of false alarms")
         found = products(base, signatures, base.residual[:, None])
         degrees = [visible_directions(found.raw[p, p], found.left[p, p]).shape[1] for p in found.places]
-        self.looks = effective_looks(found.left, degrees, found.places)
+        self.looks = counted_looks(found.left, degrees, found.places, [s.effect.name for s in signatures])
 
     def _linear_model(self, base: Stack, stacked: Stack, signatures: Sequence[Signature], mine: Sequence[Signature],
                       ) -> tuple[LinearLibrary, tuple[int, ...], list[int]]:
@@ -399,7 +399,7 @@ class Workflow:
             found = [drop(s) for s in own]
             best = int(np.argmax([d for d, _ in found]))
             value, degrees = found[best]
-            if degrees == 0 or after_search(float(chi2_tail(value, degrees)), self.looks) > WORTH_REFINING:
+            if degrees == 0 or self.looks.after(float(chi2_tail(value, degrees)), name) > WORTH_REFINING:
                 continue
             setting = own[best].setting
             for index, parameter in enumerate(self.library[name].parameters):
@@ -439,7 +439,7 @@ class Workflow:
     def significant(self, drop: float, name: str) -> float:
         """Probability after the search that noise lowers the sum of squares by ``drop`` through this effect."""
         degrees = max(self._degrees.get(name, 1), 1)
-        return after_search(float(chi2_tail(max(drop, 0.0), degrees)), self.looks)
+        return self.looks.after(float(chi2_tail(max(drop, 0.0), degrees)), name)
 
     def pruned(self, here: _Round, chosen: Sequence[int]) -> list[int]:
         """The set without what is not significant beside the rest, the weakest leaving first.
@@ -649,7 +649,7 @@ class Workflow:
             final = solve(problem.starting_at(usable))
         verdict, why = _verdict(findings, before, after)
         return Findings(verdict, why, before, after, findings, tuple(tables), plain, final, tuple(sorted(excluded)),
-                        self.looks, time.perf_counter() - began)
+                        self.looks.names, time.perf_counter() - began)
 
     def ordered(self, effects: Collection[str]) -> tuple[str, ...]:
         """The effects: the one that explains most by itself, then the one that explains most beside it, and so on."""

@@ -293,7 +293,7 @@ def _what(explanation: Explanation) -> str:
     if not findings.findings:
         if findings.verdict == "quiet":
             return (f"None of the {len(explanation.workflow.library)} effects of the library is significant "
-                    f"(a search that amounts to {findings.looks:.0f} independent looks).")
+                    f"(a search that amounts to {findings.looks:.0f} independent names).")
         return "No effect of the library explains it."
     parts = []
     for f in findings.findings:

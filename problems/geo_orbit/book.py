@@ -19,10 +19,10 @@ import casadi as ca
 import numpy as np
 
 from estimator.models.compiled import compiled
-from estimator.models.loops import Mapped
 from estimator.models.earth import GRAVITATIONAL_PARAMETER
 from estimator.models.earth_orientation import EARTH_ROTATION_RATE
 from estimator.models.light_time import Earth
+from estimator.models.loops import Mapped
 from estimator.models.orbit_spherical import (
     cartesian_from_spherical,
     shaping_step,

@@ -20,8 +20,8 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from estimator.effects.declaration import ENVIRONMENT, EffectInstance, Layout, Sample
-from estimator.models.loops import Mapped
 from estimator.models.errors import NotFiniteError, RequestError
+from estimator.models.loops import Mapped
 from problems.alignment.simulation.orbit import Orbit
 
 EffectValues = float | Sequence[float] | Mapping[str, float] | None
