@@ -22,8 +22,8 @@ DRAWS = 4000
 class Looks:
     """How many independent looks a search over a library amounts to.
 
-    The level is shared among the names, not among their settings: a mode that is tried at dozens of frequencies must not
-    cost an effect that is tried once the power to be seen.
+    The level is shared among the names, not among their settings: a mode that is tried at dozens of frequencies must
+    not cost an effect that is tried once the power to be seen.
 
     Attributes:
         own: by name, looks among the settings of its searched parameter; 1 where a name is not listed.

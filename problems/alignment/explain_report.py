@@ -649,7 +649,8 @@ def _scores_section(explanation: Explanation) -> str:
     parts = ['<h2 id="scores">Every candidate at the plain model</h2>',
              "<p>Score: drop of the sum of squares that the effect would bring, the calibration refitted with it. "
              "Power: probability to see it here if it had its typical size. The search over the whole library amounts "
-             f"to {findings.looks:.0f} independent names, each at the best of its settings.</p>", _table(head, rows[:10])]
+             f"to {findings.looks:.0f} independent names, each at the best of its settings.</p>",
+             _table(head, rows[:10])]
     if len(rows) > 10:
         parts.append(f"<details><summary>{len(rows) - 10} more candidates</summary>{_table(head, rows[10:])}</details>")
     hidden = [s for s in table if s.degrees == 0 or s.absorbed_by]
