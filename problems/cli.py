@@ -31,6 +31,7 @@ COMMANDS: dict[str, str | dict[str, str]] = {
     "orbit": {
         "solve": "problems.geo_orbit.commands:solve_command",
         "explain": "problems.geo_orbit.commands:explain_command",
+        "simulate": "problems.geo_orbit.commands:simulate_command",
     },
     "stars": "problems.star_configuration.commands:stars",
     "demo": "problems.alignment.commands_demo:demo",

@@ -104,7 +104,7 @@ def _prediction(estimate: Estimate, channels: Collection[str], names: Collection
             continue
         rows = np.zeros((_samples(residual, part, True)[0].size, len(scales)))
         if isinstance(residual, KernelResidual) and residual.accepted is not None:
-            jacobian = part.jacobian[~residual.accepted].reshape(len(rows), -1)
+            jacobian = part.jacobian[~residual.accepted].reshape(len(rows), part.jacobian.shape[-1])
             start = 0
             for u in part.columns:
                 width = u.manifold.tangent

@@ -1,4 +1,4 @@
-"""``boresight orbit solve`` and ``boresight orbit explain``: tracking data of one satellite to its orbit."""
+"""``boresight orbit solve``, ``explain`` and ``simulate``: tracking data of one satellite to its orbit, and back."""
 
 from __future__ import annotations
 
@@ -94,5 +94,60 @@ def explain_command(
                 say=lambda text: bar.update(task, description=text, advance=1),
             )
         return found.as_dict(), lambda: str(found)
+
+    console.run(work, as_json=as_json)
+
+
+@app.command("simulate")
+def simulate_command(
+    settings: Annotated[Path, typer.Argument(help="stations, forces, epoch and orbit: one TOML file")],
+    out: Annotated[Path, typer.Argument(help="CCSDS TDM to write")],
+    hours: Annotated[float, typer.Option(help="length of the data, h")] = 24.0,
+    step: Annotated[float, typer.Option(help="s between measurements of one kind at one station")] = 420.0,
+    kinds: Annotated[str, typer.Option(help="range, range_rate, azimuth_elevation; separated by commas")]
+    = "range,azimuth_elevation",
+    effect: Annotated[
+        list[str] | None, typer.Option(help="a hidden effect, name=value,value,...; may be repeated")
+    ] = None,
+    elevation: Annotated[float, typer.Option(help="lowest elevation, degrees")] = 8.0,
+    seed: Annotated[int, typer.Option(help="of the noise; negative for none")] = 1,
+    as_json: AsJson = False,
+) -> None:
+    """Write what the stations would measure of the settings' orbit, with noise and hidden effects."""
+
+    def work() -> tuple[dict[str, Any], Callable[[], object]]:
+        import numpy as np
+
+        from estimator.models.errors import RequestError
+        from problems.geo_orbit.settings import read_toml, settings_from
+        from problems.geo_orbit.simulator import simulated_tracking
+        from problems.readers.tracking_ccsds import write_tdm
+
+        effects = {}
+        for text in effect or []:
+            name, _, numbers = text.partition("=")
+            try:
+                effects[name.strip()] = [float(n) for n in numbers.split(",")]
+            except ValueError as error:
+                raise RequestError("an effect is not readable", where="--effect", value=text,
+                                   remedy="write name=value or name=value,value, for example range-bias=120") from error
+        tables = read_toml(settings)
+        # What a TDM means where the settings are silent.
+        tables.setdefault("measurements", {}).setdefault("range", "sum")
+        chosen = settings_from(tables, {})
+        tracking = simulated_tracking(
+            chosen,
+            hours=hours,
+            step=step,
+            kinds=[k.strip() for k in kinds.split(",") if k.strip()],  # type: ignore[misc]
+            effects=effects,
+            seed=None if seed < 0 else seed,
+            minimum_elevation=float(np.radians(elevation)),
+        )
+        write_tdm(out, tracking, time_tag=chosen.time_tag)
+        answer = {"file": str(out), "observations": {f"{o.name}/{o.kind}": len(o.time) for o in tracking.observations},
+                  "effects": effects}
+        listed = "\n".join(f"  {name}: {count}" for name, count in answer["observations"].items())  # type: ignore[attr-defined]
+        return answer, lambda: f"{out}\n{listed}"
 
     console.run(work, as_json=as_json)

@@ -17,12 +17,14 @@ from estimator.estimate import Estimate
 from estimator.problem import Problem
 from estimator.residuals import KernelResidual
 from problems.geo_orbit.effects import OrbitEffect, instances
-from problems.geo_orbit.kept_orbit import KeptExplanation, explained_kept
+from problems.geo_orbit.kept_orbit import KeptExplanation, explained_kept, period_of
 from problems.geo_orbit.problem import OrbitModel, orbit_model, orbit_problem
 from problems.geo_orbit.settings import OrbitSettings
 from problems.geo_orbit.solution import solve_from_far
 from problems.geo_orbit.tracking import Tracking
 
+SIDEREAL_DAY = 86164.1  # s
+_NEAR_STATIONARY = 0.02  # part by which the period of a satellite that is kept on station differs from a sidereal day
 _BLOCKS = 25  # into which the samples of a residual are cut for holding some out
 
 
@@ -194,8 +196,9 @@ def explained(
 ) -> OrbitExplanation | KeptExplanation:
     """Find what the model of the settings misses in tracking data.
 
-    Where the data are long enough to hold manoeuvres of a satellite that is kept on station, these are looked for first
-    (:mod:`problems.geo_orbit.kept_orbit`); with none in the data the generic workflow does the rest.
+    A satellite near the stationary orbit is kept there: where the data are long enough to hold manoeuvres, these are
+    looked for first (:mod:`problems.geo_orbit.kept_orbit`), and with none in the data the generic workflow does the
+    rest. On any other orbit it is the other way round.
 
     Args:
         tracking: the observations.
@@ -209,12 +212,19 @@ def explained(
     """
     began = time.perf_counter()
     model = orbit_model(tracking, settings)
-    kept = explained_kept(model, hold_out=hold_out, without=without, say=say)
-    if kept is not None:
-        return kept
+    state = np.concatenate([model.position, model.velocity])
+    kept_on_station = abs(period_of(state) / SIDEREAL_DAY - 1) < _NEAR_STATIONARY
+    if kept_on_station:
+        kept = explained_kept(model, hold_out=hold_out, without=without, say=say)
+        if kept is not None:
+            return kept
     plain = solve_from_far(orbit_problem(model), model)
     model = replace(model, position=plain.values["position"], velocity=plain.values["velocity"])
     subject = OrbitSubject(model, hold_out, tuple(without))
     workflow = Workflow(subject, say)
     findings = workflow.run()
+    if findings.verdict == "unknown" and not kept_on_station:
+        kept = explained_kept(model, hold_out=hold_out, without=without, say=say)
+        if kept is not None:
+            return kept
     return OrbitExplanation(subject, workflow, findings, time.perf_counter() - began)
