@@ -29,8 +29,8 @@ from estimator.unknowns import Unknown, Vector
 
 _SAME_GRID = 1e-3  # relative change of the state at a segment's start up to which its grid is kept
 _EDGE = 3600.0  # s that the two ends of a segment may have moved together for its steps to be tried again
-_LOOSE = 1e-4  # m of error allowed per step from which steps may be carried over
-_GRIDS = 256  # segments of which the steps are kept
+_LOOSE = 1.5e-5  # m of error allowed per step from which steps may be carried over
+_GRIDS = 1024  # segments of which the steps are kept
 
 
 _SHORTEST = 1.0  # s that a burn of finite length takes at the least
@@ -147,6 +147,7 @@ class OrbitArc:
         """The propagated orbit at ``values``, computed once for the same values."""
         key = tuple(np.asarray(values[u.name], dtype=float).tobytes() for u in self.unknowns)
         if self._last.get("key") != key:
+            self._last.pop("states", None)
             self._last["segments"] = self._propagated(values)
             self._last["key"] = key
         return self._last["segments"]
@@ -274,11 +275,32 @@ class OrbitArc:
         self._grids[a, b] = (np.array(x), grid)
 
     def at(self, times: np.ndarray, values: Values) -> tuple[np.ndarray, np.ndarray]:
-        """States (n, 6) and derivatives (n, 6, columns) at ``times`` (n,), s; the later side at a velocity step."""
+        """States (n, 6) and derivatives (n, 6, columns) at ``times`` (n,), s; the later side at a velocity step.
+
+        Stations that measure at the same instants ask for the same states: what was computed at the same values is kept.
+        """
         times = np.asarray(times, dtype=float)
+        segments = sorted(self.segments(values), key=lambda s: s.low)
+        known = self._last.get("states")
+        fresh = times if known is None else times[~np.isin(times, known[0])]
+        if known is None or len(fresh):
+            added = np.unique(fresh)
+            states, derivatives = self._evaluated(added, segments)
+            if known is not None:
+                added = np.concatenate([known[0], added])
+                order = np.argsort(added)
+                added = added[order]
+                states = np.concatenate([known[1], states])[order]
+                derivatives = np.concatenate([known[2], derivatives])[order]
+            known = self._last["states"] = (added, states, derivatives)
+        if np.array_equal(times, known[0]):
+            return known[1], known[2]
+        place = np.searchsorted(known[0], times)
+        return known[1][place], known[2][place]
+
+    def _evaluated(self, times: np.ndarray, segments: Sequence[_Segment]) -> tuple[np.ndarray, np.ndarray]:
         states, derivatives = np.empty((len(times), 6)), np.zeros((len(times), 6, self.columns))
         left = np.ones(len(times), dtype=bool)
-        segments = sorted(self.segments(values), key=lambda s: s.low)
         for number, segment in enumerate(segments):
             inside = left & (times < segment.high) if number + 1 < len(segments) else left
             if not inside.any():

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -20,10 +20,13 @@ from estimator.models.earth_orientation import utc_text
 from estimator.models.errors import InputError
 from estimator.problem import Problem
 from estimator.residuals import KernelResidual
+from problems.geo_orbit.common_calibration import fitted_together
 from problems.geo_orbit.effects import OrbitEffect, chosen, instances
+from problems.geo_orbit.engine import Engine
 from problems.geo_orbit.manoeuvres import (
     FAMILY,
     LEVEL,
+    MONTHS,
     Fit,
     Found,
     Manoeuvre,
@@ -64,10 +67,14 @@ def period_of(state: np.ndarray) -> float:
 
 
 def calibration(model: OrbitModel, without: Sequence[str] = ()) -> tuple[OrbitEffect, ...]:
-    """Effects that the search for manoeuvres must not mistake for one: biases, scale, the two parts of sunlight."""
+    """Effects that the search for manoeuvres must not mistake for one: biases, scale, clock, sunlight in two parts.
+
+    A clock that is wrong at all stations alike turns the orbit against Sun and Moon. Days of data do not show it,
+    months do, and a fit that lacks it leaves a daily wave of metres that is another one at every station.
+    """
     layout = model.layout
     offered = {e.name: e for e in instances(layout) if e.name not in without and e.family not in without}
-    names = ["range-scale-error", "solar-radiation-pressure", "solar-radiation-pressure:oblique"]
+    names = ["range-scale-error", "timetag-offset", "solar-radiation-pressure", "solar-radiation-pressure:oblique"]
     names.append("range-bias:each" if "range-bias:each" in offered else "range-bias")
     for station, kinds in layout.stations:
         if set(kinds) & {"azimuth_elevation", "direction_cosines"}:
@@ -77,7 +84,15 @@ def calibration(model: OrbitModel, without: Sequence[str] = ()) -> tuple[OrbitEf
     return tuple(offered[n] for n in dict.fromkeys(names) if n in offered)
 
 
-_WIDTHS = {"range-bias": 1e4, "range-scale-error": 2e-3, "angle-bias": 0.01, "range-rate-bias": 1.0}  # m, 1, rad, m/s
+_SLOW = ("timetag-offset",)  # what only a long orbit tells
+# m, 1, s, rad, m/s
+_WIDTHS = {"range-bias": 1e4, "range-scale-error": 2e-3, "timetag-offset": 100.0, "angle-bias": 0.01,
+           "range-rate-bias": 1.0}
+
+
+def _lasting(effects: Sequence[OrbitEffect], span: float, period: float) -> tuple[OrbitEffect, ...]:
+    """Those of the calibration that data of a length (s) can tell."""
+    return tuple(e for e in effects if e.name not in _SLOW or span > MONTHS * period)
 
 
 def _priors(effects: Sequence[OrbitEffect], problem: Problem) -> tuple[Prior, ...]:
@@ -142,6 +157,7 @@ class KeptExplanation:
         effects: largest first.
         undetermined: numbers of the calibration that the data leave open, in words.
         rejected: names that helped somewhere and were not believed, with the reason; missed: samples in no arc.
+        expected: by channel, how far the held-out data miss over what was to be expected of noise and covariance, RMS.
         rms: root mean square by channel of the fitted and the held-out data, before and after everything.
     """
 
@@ -161,6 +177,7 @@ class KeptExplanation:
     arcs: tuple[KeptExplanation, ...] = ()
     rejected: tuple[str, ...] = ()
     missed: int = 0
+    expected: dict[str, float] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """The machine-readable answer of ``boresight orbit explain``."""
@@ -182,7 +199,8 @@ class KeptExplanation:
             "effects": [_entry(e) for e in self.effects],
             "next_measurement": self.next_measurement,
             "left": [
-                {"channel": c, "rms": fitted, "held_out_rms": held, "unit": unit, "common_error": self.structure}
+                {"channel": c, "rms": fitted, "held_out_rms": held, "held_out_over_expected": self.expected.get(c),
+                 "unit": unit, "common_error": self.structure}
                 for c, (fitted, held, unit) in self.after.items()
             ],
             "left_where": self.left_where(),
@@ -196,7 +214,8 @@ class KeptExplanation:
                     "to": self._utc(p.found.high),
                     "manoeuvres": sum(e.name.startswith(FAMILY) for e in p.effects),
                     "measurements": p.fit.rows,
-                    "left": {c: {"rms": a, "held_out_rms": b, "unit": u} for c, (a, b, u) in p.after.items()},
+                    "left": {c: {"rms": a, "held_out_rms": b, "held_out_over_expected": p.expected.get(c), "unit": u}
+                             for c, (a, b, u) in p.after.items()},
                 }
                 for p in self.arcs
             ],
@@ -329,37 +348,86 @@ def explained_kept(model: OrbitModel, *, hold_out: float = 0.2, without: Sequenc
     if often < _OFTEN or last - first < _SHORTEST_SPAN * period or FAMILY in without:
         return None
     model = replace(model, finite_burns=True)
-    effects = calibration(model, without)
+    every = calibration(model, without)
     arcs: list[tuple[OrbitModel, Found]] = []
     spans = [(first, last)]
     known: dict[str, float] = {}
+    engine: Engine | None = None
     while spans and len(arcs) < _MOST_ARCS:
         low, high = spans.pop(0)
         if high - low < _SHORTEST_SPAN * period:
             continue
         part = _between(model, low, high)
+        effects = _lasting(every, high - low, period)
         problem = _with_held_out(orbit_problem(part, [e.name for e in effects]), period, hold_out)
-        search = Search(problem, _priors(effects, problem), period, say, known)
+        search = Search(problem, _priors(effects, problem), period, say, known, engine=engine, slow=_SLOW)
         try:
             found = search.run(state, 0.0)
         except InputError:
             continue
         known = known or dict(found.noise)
+        engine = search.engine or engine
         # What one orbit does not fit is looked at by itself.
         spans += [(low, found.low - 1.0), (found.high + 1.0, high)]
         if found.fit.square < _FITS * found.fit.degrees:
             arcs.append((_between(model, found.low, found.high), found))
     if not any(found.names for _, found in arcs):
         return None
-    offers = [_further(part, found, effects, without, hold_out, say) for part, found in arcs]
+    offers = [_further(part, found, _lasting(every, found.high - found.low, period), without, hold_out, say)
+              for part, found in arcs]
     believed, rejected = consistent(offers, sorted((part.span for part, _ in arcs)))
-    pieces = []
-    for (part, found), offer in zip(arcs, offers, strict=True):
-        names = [n for n in offer if n in believed]
-        pieces.append(_concluded(part, found, effects, names, hold_out, say))
+    arcs, others = _together(arcs, every, believed, hold_out, say)
+    pieces: list[KeptExplanation] = []
+    for (part, found), known_of_others in zip(arcs, others, strict=True):
+        # What the longest arc does not confirm is in none.
+        own = _lasting(every, found.high - found.low, period)
+        pieces.append(_concluded(part, found, own, believed, known_of_others, hold_out, say, first=not pieces))
+        believed = tuple(n for n in believed if n in {u.name for u in pieces[0].fit.problem.unknowns})
     samples = sum(len(o.time) for o in model.tracking.observations)
     missed = samples - sum(len(o.time) for part, _ in arcs for o in part.tracking.observations)
     return _merged(model, pieces, rejected, missed, time.perf_counter() - began)
+
+
+def _together(arcs: Sequence[tuple[OrbitModel, Found]], own: Sequence[OrbitEffect], further: Sequence[str],
+              hold_out: float, say: Say) -> tuple[list[tuple[OrbitModel, Found]], list[list[Prior]]]:
+    """Arcs, the longest first, fitted with one calibration, and what each knows of it from the others."""
+    ordered = sorted(arcs, key=lambda item: -item[1].fit.rows)
+    names = [e.name for e in own] + list(further)
+    names += [u.name for u in ordered[0][1].fit.problem.unknowns
+              if u.name not in ("position", "velocity", *names) and not u.name.startswith(FAMILY)]
+    if len(ordered) == 1 or len({tuple(o.name for o in part.tracking.observations) for part, _ in ordered}) > 1:
+        # Arcs without some of the stations have other unknowns.
+        return ordered, [[] for _ in ordered]
+    starts = [_start(part, found, _lasting(own, found.high - found.low, found.search.period), further, hold_out)
+              for part, found in ordered]
+
+    def again(i: int, fit: Fit, others: Sequence[Prior]) -> Fit:
+        say(f"calibration common to {len(ordered)} arcs, arc {i + 1}")
+        problem, _, priors = starts[i]
+        return gauss_newton(problem, fit.values, [*priors, *others], ordered[i][1].noise, iterations=15, enough=1e-4)
+
+    first = [gauss_newton(problem, point, priors, found.noise, iterations=0)
+             for (problem, point, priors), (_, found) in zip(starts, ordered, strict=True)]
+    fits, others = fitted_together(first, names, again)
+    moved = [(part, replace(found, fit=fit, manoeuvres=tuple(Manoeuvre.of(fit.values[n]) for n in found.names)))
+             for (part, found), fit in zip(ordered, fits, strict=True)]
+    return moved, others
+
+
+def _start(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], further: Sequence[str], hold_out: float,
+           ) -> tuple[Problem, dict[str, np.ndarray], list[Prior]]:
+    """The joint problem of an arc with further effects, a point near its optimum, and what is assumed of sizes."""
+    every = (*own, *chosen(model.layout, further))
+    problem, point = _with_manoeuvres(model, found, [e.name for e in every], (), hold_out)
+    priors = [p for p in found.search.priors if all(any(u.name == n for u in problem.unknowns) for n in p.names)]
+    for e in every:
+        if e not in own:
+            # Its usual size is no bound: a clock that is a minute off is off by thousands of times that.
+            widths = [max(10 * p.scale, *np.abs(p.plausible)) for p in e.parameters]
+            priors.append(Prior.of(e.name, np.zeros(len(e.parameters)), np.array(widths)))
+    for name, m in zip(found.names, found.manoeuvres, strict=True):
+        priors.append(found.search.prior_of(name, m))
+    return problem, point, priors
 
 
 Offer = dict[str, tuple[np.ndarray, np.ndarray]]
@@ -428,8 +496,10 @@ def _merged(model: OrbitModel, pieces: Sequence[KeptExplanation], rejected: Sequ
     ratio = float(np.sqrt(np.sum(rows * [p.ratio**2 for p in pieces]) / rows.sum()))
     noise = pooled([_noise(p.found, p.fit) for p in pieces])
     rejected = [*rejected, *dict.fromkeys(w for p in pieces for w in p.rejected)]
-    merged = replace(longest, model=model, before=before, after=after, structure=structure, ratio=ratio,
-                     effects=tuple(effects), seconds=seconds, arcs=tuple(pieces), rejected=tuple(rejected),
+    expected = {c: float(np.sqrt(np.mean([p.expected[c] ** 2 for p in pieces for _ in range(p.fit.rows)
+                                          if c in p.expected]))) for c in longest.expected}
+    merged = replace(longest, model=model, expected=expected, before=before, after=after, structure=structure,
+                     ratio=ratio, effects=tuple(effects), seconds=seconds, arcs=tuple(pieces), rejected=tuple(rejected),
                      missed=missed)
     verdict, why = _verdict(merged, {c: v[0] for c, v in noise.items()})
     return replace(merged, verdict=verdict, why=why)
@@ -580,15 +650,16 @@ def _further(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], withou
     return answer
 
 
-def _concluded(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], further: Sequence[str], hold_out: float,
-               say: Say) -> KeptExplanation:
+def _concluded(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], further: Sequence[str],
+               known: Sequence[Prior], hold_out: float, say: Say, *, first: bool = True) -> KeptExplanation:
     """The joint fit with the effects that were chosen, and the proof of each.
 
-    What the held-out passes do not speak for leaves, and the rest is fitted once more.
+    What the held-out passes do not speak for leaves, and the rest is fitted once more. ``known`` is what other arcs
+    tell of the calibration; of further effects the ``first`` arc, the longest, decides.
     """
-    answer = _proved(model, found, own, further, hold_out, say)
+    answer = _proved(model, found, own, further, known, hold_out, say)
     proved = {e.name for e in answer.effects if _held(e)}
-    unproved = [n for n in further if n not in proved]
+    unproved = [n for n in further if n not in proved] if first else []
     weak = set()
     for e in answer.effects:
         if e.name.startswith(FAMILY):
@@ -601,12 +672,12 @@ def _concluded(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], furt
     kept = [(n, m) for k, (n, m) in enumerate(zip(found.names, found.manoeuvres, strict=True))
             if f"{FAMILY}:{k + 1}" not in weak]
     fewer = replace(found, names=tuple(n for n, _ in kept), manoeuvres=tuple(m for _, m in kept))
-    again = _proved(model, fewer, own, [n for n in further if n not in unproved], hold_out, say)
+    again = _proved(model, fewer, own, [n for n in further if n not in unproved], known, hold_out, say)
     if weak and again.fit.square > _NEEDED * answer.fit.square:
         # Something was there after all; what it is these data do not tell.
         again = answer
         if unproved:
-            again = _proved(model, found, own, [n for n in further if n not in unproved], hold_out, say)
+            again = _proved(model, found, own, [n for n in further if n not in unproved], known, hold_out, say)
     return replace(again, rejected=tuple(f"{n} makes the held-out passes no better" for n in unproved))
 
 
@@ -615,18 +686,12 @@ def _held(e: KeptEffect) -> bool:
     return any(b < a for a, b in e.proof.held_out.values())
 
 
-def _proved(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], further: Sequence[str], hold_out: float,
-            say: Say) -> KeptExplanation:
+def _proved(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], further: Sequence[str],
+            known: Sequence[Prior], hold_out: float, say: Say) -> KeptExplanation:
     every = (*own, *chosen(model.layout, further))
     say("joint fit with " + (", ".join(further) or "nothing further"))
-    problem, point = _with_manoeuvres(model, found, [e.name for e in every], (), hold_out)
-    priors = [p for p in found.search.priors if all(any(u.name == n for u in problem.unknowns) for n in p.names)]
-    for e in every:
-        if e not in own:
-            priors.append(Prior.of(e.name, np.zeros(len(e.parameters)), np.array([10 * p.scale for p in e.parameters])))
-    for name, m in zip(found.names, found.manoeuvres, strict=True):
-        priors.append(found.search.prior_of(name, m))
-    fit = gauss_newton(problem, point, priors, found.noise, iterations=15, enough=1e-4)
+    problem, point, priors = _start(model, found, own, further, hold_out)
+    fit = gauss_newton(problem, point, [*priors, *known], found.noise, iterations=15, enough=1e-4)
     say("one orbit without manoeuvres")
     first, last = model.span
     bare = _with_held_out(orbit_problem(model, [e.name for e in own]), found.search.period, hold_out)
@@ -646,6 +711,7 @@ def _proved(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], further
     level = max(1.0, fit.square / fit.degrees) * max(found.shared, structure)
     spread = np.sqrt(np.diag(covariance) * level)
     places = (last - first) / found.search.period * 48
+    expected = _expected(held, covariance / np.outer(fit.scales, fit.scales) * level)
     effects = []
 
     def proved(columns: list[int], fixed: list[int], values: np.ndarray, looks: float) -> _Proof:
@@ -719,7 +785,14 @@ def _proved(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], further
     ends = {c: (v, held_after.get(c, float("nan")), unit_of[c]) for c, v in after.items()}
     begins = {c: (v, before_held.get(c, float("nan")), unit_of[c]) for c, v in before_seen.items()}
     return KeptExplanation(model, found, fit, plain, begins, ends, structure, ratio_after, tuple(effects), undetermined,
-                           "unknown", "", 0.0)
+                           "unknown", "", 0.0, expected=expected)
+
+
+def _expected(held: _Rows, covariance: np.ndarray) -> dict[str, float]:
+    """How far held-out rows miss the fit over what its covariance (scaled unknowns) and the noise let expect, RMS."""
+    spread = np.sqrt(1.0 + np.einsum("ij,jk,ik->i", held.jacobian, covariance, held.jacobian))
+    return {str(c): float(np.sqrt(np.mean((held.residual / spread)[held.channel == c] ** 2)))
+            for c in dict.fromkeys(held.channel)}
 
 
 def _told_together(fit: Fit, steps: dict[str, Manoeuvre], spread: np.ndarray, found: Found) -> list[list[str]]:
@@ -777,9 +850,17 @@ def _verdict(answer: KeptExplanation, noise: dict[str, float]) -> tuple[str, str
     others = ", ".join(" or ".join(g) for g in groups)
     missing = f"{manoeuvres} manoeuvres" if manoeuvres > 1 else "one manoeuvre"
     missing += f" and {others}" if others else ""
-    left = "; ".join(f"{a:.3g} {u} RMS in {c.replace('_', ' ')} ({b:.3g} {u} in data no fit has seen, noise of quiet "
-                     f"data {noise[c]:.2g} {u})" for c, (a, b, u) in after.items())
-    loud = any(np.nanmax([a, b]) > max(_NAMED * noise[c], _METRE.get(c, 0.0)) for c, (a, b, _) in after.items())
+    over = answer.expected
+    left = "; ".join(f"{a:.3g} {u} RMS in {c.replace('_', ' ')} ({b:.3g} {u} in data no fit has seen, "
+                     f"{over.get(c, float('nan')):.2g} times what was to be expected there; noise of quiet data "
+                     f"{noise[c]:.2g} {u})" for c, (a, b, u) in after.items())
+
+    def too_much(c: str, fitted: float, held_out: float) -> bool:
+        limit = max(_NAMED * noise[c], _METRE.get(c, 0.0))
+        # A pass beside a burn is predicted worse than it is measured: what counts there is what was to be expected.
+        return fitted > limit or (held_out > limit and not over.get(c, np.inf) < _NAMED)
+
+    loud = any(too_much(c, a, b) for c, (a, b, _) in after.items())
     if loud or answer.missed:
         why = f"missing were {missing}; the library holds no explanation of the rest: {left}"
         if answer.missed:

@@ -39,13 +39,17 @@ from estimator.orbit_signal import OrbitArc, OrbitSignal, VelocityStep
 from estimator.problem import Problem
 from estimator.residuals import KernelResidual, Linearization
 from estimator.unknowns import Unknown, Vector
+from problems.geo_orbit.engine import Engine, engine_of
 
 Say = Callable[[str], None]
 Values = dict[str, np.ndarray]
 
 FAMILY = "impulsive-manoeuvre"
 LEVEL = 1e-3  # probability of a manoeuvre where there is none, over the whole search
-_LOOSE = Tolerance(1e-12, (1e-3, 1e-3, 1e-3, 1e-7, 1e-7, 1e-7))  # m, m/s: far below any tracking noise
+_LOOSE = Tolerance(1e-12, (1e-3, 1e-3, 1e-3, 1e-7, 1e-7, 1e-7))  # m, m/s: below tracking noise over some revolutions
+_TIGHT = Tolerance(1e-14, (2e-5, 2e-5, 2e-5, 1e-9, 1e-9, 1e-9))  # what 1e-7 m/s make in a month is a metre
+MONTHS = 14.0  # revolutions from which data tell what turns the orbit against Sun and Moon
+_SHORTLY = 4.0  # revolutions over which the loose one does
 _KEPT = 3.0  # revolutions of data that the growing stretch keeps
 _GROWTH = 0.5  # revolutions by which it grows
 _GRID = 48  # tried edges of a burn per revolution
@@ -55,13 +59,23 @@ _AFTER = 0.3  # revolutions of data after the first sign of a step that are used
 _INFLATED = 3.0  # factor on the sigmas of the calibration that the quiet data tell
 _BACK = 0.4  # revolutions before the first sign of a step in which it is looked for
 _JOINED = 6.0  # revolutions by which the joint fit is extended
+_LONGER = 0.3  # or by this part of what it spans
+_NEEDED = 1.1  # growth of what is left that tells that what was dropped was needed
+_LOUD = 2.0  # mean square over the usual one where more is looked for
+_MOST_COMPLETED = 12
+_PASSES = 3
+_ALIKE = 0.1  # relative difference of lengths that is none
+_GROWN = 1.3  # growth of what is left, by an extension, that something in it explains
+_BESIDE = 1.6  # revolutions on both sides of a manoeuvre that are fitted to tell what it is
 _BROKEN = 16.0  # mean square over that of quiet data beyond which one orbit does not fit
 _EDGE_STEP = 3600.0  # s that an edge of a burn moves in the first step of a fit
 _FASTEST = 50.0  # m/s, prior sigma of a velocity step
 _LONGEST = 0.25  # revolutions, prior sigma of the duration of a burn
 _ROUGHEST = 4.0  # mean square over that of quiet data that growing fits may make the measure of the joint fit
 _SURE = 3.0  # sigmas
-_ALIKE = 0.3  # relative sigma of the length of a burn about that of the others in the same direction
+_CURVED = 1e3  # growth of the cost in a step that may be curvature alone
+_LARGEST_TURN = 0.1  # rad of a step that turns the orbit
+_SHORT = 0.005  # revolutions that a burn of an engine takes, below which it is an impulse
 _NOISIER = 1.5  # factor on the noise of all data that the quiet stretches of a part of them may reach
 
 
@@ -254,6 +268,26 @@ def gauss_newton(problem: Problem, values: Mapping[str, np.ndarray], priors: Seq
     def flat(v: Mapping[str, np.ndarray]) -> np.ndarray:
         return np.concatenate([np.atleast_1d(v[u.name]) for u in unknowns])
 
+    def tried(v: Values, step: np.ndarray) -> tuple[Values, Any, np.ndarray, float]:
+        """The point after a step, its rows, the residuals of its priors, and its cost."""
+        trial = dict(v)
+        for u in unknowns:
+            trial[u.name] = v[u.name] + (step * scales)[places[u.name]]
+            if u.name.startswith(FAMILY) and u.manifold.tangent == 5:
+                # A duration is positive, and no step halves it more than once.
+                trial[u.name][4] = max(trial[u.name][4], 0.5 * v[u.name][4], 10.0)
+        if "position" in places and "velocity" in places:
+            trial["position"], trial["velocity"] = turned(
+                v["position"], v["velocity"], *((step * scales)[places[n]] for n in ("position", "velocity")))
+        off = root @ flat(trial) - target
+        try:
+            with np.errstate(all="ignore"):
+                new = rows(trial)
+            lowered = float(new[1] @ new[1] + off @ off)
+        except (InfeasibleError, ValueError):
+            return trial, None, off, np.inf
+        return trial, new, off, lowered
+
     current: Values = {k: np.array(v, dtype=float) for k, v in values.items()}
     parts, r, j, time = rows(current)
     off = root @ flat(current) - target
@@ -268,21 +302,18 @@ def gauss_newton(problem: Problem, values: Mapping[str, np.ndarray], priors: Seq
         length = float(np.linalg.norm(stacked @ full))
         if length < tolerance:
             break
-        for _ in range(5):
+        for attempt in range(5):
             step = shrunk * _held(stacked, right, full, edges, longest / scales[edges])
-            trial = dict(current)
-            for u in unknowns:
-                trial[u.name] = current[u.name] + (step * scales)[places[u.name]]
-                if u.name.startswith(FAMILY) and u.manifold.tangent == 5:
-                    # A duration is positive, and no step halves it more than once.
-                    trial[u.name][4] = max(trial[u.name][4], 0.5 * current[u.name][4], 10.0)
-            try:
-                with np.errstate(all="ignore"):
-                    new = rows(trial)
-                off_new = root @ flat(trial) - target
-                lowered = float(new[1] @ new[1] + off_new @ off_new)
-            except (InfeasibleError, ValueError):
-                lowered = np.inf
+            trial, new, off_new, lowered = tried(current, step)
+            if attempt == 0 and cost * (1 + 1e-12) < lowered < _CURVED * cost:
+                # Along what the data hardly tell (longitude against scale and biases) a step of kilometres leaves
+                # metres of curvature, which the next one takes away.
+                right_new = -np.concatenate([new[1], off_new])
+                rows_new = np.vstack([new[2], inverse])
+                second = _held(rows_new, right_new, _least_squares(rows_new, right_new), edges, longest / scales[edges])
+                again = tried(trial, second)
+                if again[3] <= cost:
+                    trial, new, off_new, lowered = again
             if np.isfinite(lowered) and lowered <= cost * (1 + 1e-12):
                 longest *= 2.0
                 shrunk = min(1.0, 2.0 * shrunk)
@@ -299,9 +330,28 @@ def gauss_newton(problem: Problem, values: Mapping[str, np.ndarray], priors: Seq
     return Fit(problem, current, parts, unknowns, r, j, inverse, off, time)
 
 
+def turned(position: np.ndarray, velocity: np.ndarray, by: np.ndarray, faster: np.ndarray,
+           ) -> tuple[np.ndarray, np.ndarray]:
+    """A state (3,), (3,) after a step (3,), (3,): the sum, but that what turns it about the Earth's axis does so.
+
+    Ranges from one continent hardly tell the longitude, so that steps turn the orbit by tenths of a degree: a hundred
+    kilometres along a straight line would change its radius by hundreds of metres.
+    """
+    x, y = position[:2]
+    angle = float((x * by[1] - y * by[0]) / max(x * x + y * y, 1e-300))
+    if abs(angle) > _LARGEST_TURN:
+        return position + by, velocity + faster
+    c, s = np.cos(angle), np.sin(angle)
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    straight = angle * np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    return turn @ position + by - straight @ position, turn @ velocity + faster - straight @ velocity
+
+
 def _least_squares(rows: np.ndarray, right: np.ndarray) -> np.ndarray:
-    q, upper = np.linalg.qr(rows)
-    return np.asarray(solve_triangular(upper, q.T @ right))
+    # With the right side as a further column there is no need of the orthonormal rows themselves.
+    upper = np.linalg.qr(np.column_stack([rows, right]), mode="r")
+    n = rows.shape[1]
+    return np.asarray(solve_triangular(upper[:n, :n], upper[:n, n]))
 
 
 def _held(rows: np.ndarray, right: np.ndarray, full: np.ndarray, edges: np.ndarray, limit: np.ndarray) -> np.ndarray:
@@ -360,7 +410,8 @@ def common_error(fit: Fit) -> float:
     return max(1.0, within) * (1 + correlation) / (1 - correlation)
 
 
-def burn_test(fit: Fit, arc: OrbitArc, nodes: np.ndarray, longest: float, shared: float = 1.0) -> BurnTest:
+def burn_test(fit: Fit, arc: OrbitArc, nodes: np.ndarray, longest: float, shared: float = 1.0,
+              engine: Engine | None = None) -> BurnTest:
     """Test a fit for one more burn between any two of ``nodes``, linearly, without another integration.
 
     With ``K(t)`` the integral of ``Phi(u)^-1 B(u)`` up to t, a burn from a to b changes the state at t by
@@ -373,6 +424,7 @@ def burn_test(fit: Fit, arc: OrbitArc, nodes: np.ndarray, longest: float, shared
         nodes: (m,) s, increasing, inside the span of the arc.
         longest: s between the edges.
         shared: of :func:`common_error`.
+        engine: the likelihood of a burn across the orbit's plane includes that of its length.
     """
     order = np.argsort(fit.time, kind="stable")
     basis, r = (a[order] for a in fit.absorbed())
@@ -409,6 +461,11 @@ def burn_test(fit: Fit, arc: OrbitArc, nodes: np.ndarray, longest: float, shared
     velocity = -np.einsum("kij,kj->ki", vectors, np.where(seen, amounts / np.where(seen, eigenvalues, 1.0), 0.0)) / size
     possible = np.linalg.norm(velocity, axis=1) < _FASTEST
     gain = np.where(possible, gain, 0.0)
+    if engine is not None:
+        apart = engine.misfit(velocity, width[:, 0, 0], float(np.diff(nodes).max()))
+        across = (np.abs(velocity[:, 2]) > np.abs(velocity[:, 1])) & (np.linalg.norm(velocity, axis=1) > engine.least)
+        noise = max(1.0, (float(r @ r) - float(gain.max(initial=0.0))) / max(fit.degrees, 1)) * shared
+        gain = np.maximum(gain - np.where(across, apart, 0.0) * noise, 0.0)
     best = float(gain.max(initial=0.0))
     degrees = max(fit.degrees - 5, 1)
     scatter = max((float(r @ r) - best) / degrees, 0.5)
@@ -458,9 +515,10 @@ class Search:
         priors: of unknowns other than the state.
         period: of the orbit, s.
         say: called with what is being done.
-        usual: length of the burns across the orbit's plane, s, once it is found; 0 before.
+        engine: what burns across the orbit's plane, once enough of them have told their length.
         known: noise by channel that the quiet stretches of a longer span have told, as a factor on the declared one:
             where burns leave no quiet stretch, a fit that misses them must not pass for noise.
+        slow: unknowns that only long stretches tell; shorter ones hold them.
     """
 
     problem: Problem
@@ -473,7 +531,9 @@ class Search:
     level: float = 1.0
     shared: float = 1.0
     calibrated: bool = False
-    usual: float = 0.0
+    engine: Engine | None = None
+    slow: tuple[str, ...] = ()
+    lengths: dict[str, tuple[np.ndarray, float, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         first = self.problem.residuals[0]
@@ -484,7 +544,8 @@ class Search:
         times = [r.time[r.accepted] if r.accepted is not None else r.time for r in self._residuals]
         self.times = np.unique(np.concatenate(times))
         self._names = 0
-        self._grids: dict[Any, Any] = {}  # steps of the integration, shared by all stretches
+        self._grids: dict[Any, Any] = {}  # steps of the integration, shared by all short stretches
+        self._long_grids: dict[Any, Any] = {}  # and by all long ones, which are integrated to another tolerance
 
     @property
     def _residuals(self) -> list[KernelResidual]:
@@ -494,8 +555,9 @@ class Search:
                 everything: bool = False) -> tuple[Problem, OrbitArc]:
         """The problem of the data between two times, with the state at ``start`` and velocity steps by name."""
         made = tuple(VelocityStep(m.unknown(n), burning=m.burning) for n, m in steps.items())
-        arc = replace(self.arc, start=start, span=(low, high), steps=made, tolerance=_LOOSE, _grids=self._grids,
-                      _last={})
+        short = high - low < _SHORTLY * self.period
+        arc = replace(self.arc, start=start, span=(low, high), steps=made, tolerance=_LOOSE if short else _TIGHT,
+                      _grids=self._grids if short else self._long_grids, _last={})
         residuals = []
         for r in self._residuals:
             keep = (r.time >= low) & (r.time <= high)
@@ -507,7 +569,10 @@ class Search:
         unknowns = {u.name: u for u in (*self.problem.unknowns, *(s.unknown for s in made)) if u.name in needed}
         values = {n: self.problem.start[n] for n in unknowns if n in self.problem.start}
         values.update({n: m.start for n, m in steps.items()})
-        return Problem(tuple(unknowns.values()), tuple(residuals), values, self.problem.held & set(unknowns)), arc
+        held = set(self.problem.held)
+        if high - low < MONTHS * self.period:
+            held |= set(self.slow)
+        return Problem(tuple(unknowns.values()), tuple(residuals), values, frozenset(held & set(unknowns))), arc
 
     def fit(self, low: float, high: float, start: float, state: np.ndarray, values: Mapping[str, np.ndarray],
             steps: Mapping[str, Manoeuvre], **options: Any) -> tuple[Fit, OrbitArc]:
@@ -524,10 +589,15 @@ class Search:
         """What is known of a manoeuvre before the fit: about when, and how long where others told."""
         mean, sigma = [m.time, 0.0, 0.0, 0.0], [self.period / 8, _FASTEST, _FASTEST, _FASTEST]
         if m.burning:
-            usual = self.usual > 0 and _northward(m)
-            mean.append(self.usual if usual else m.duration)
-            sigma.append(_ALIKE * self.usual if usual else _LONGEST * self.period)
-        return Prior.of(name, np.array(mean), np.array(sigma))
+            mean.append(m.duration)
+            sigma.append(_LONGEST * self.period)
+        prior = Prior.of(name, np.array(mean), np.array(sigma))
+        if self.engine is None or not m.burning or not self.engine.made(m.velocity):
+            return prior
+        # Length and size are tied; neither is known.
+        root = prior.root.copy()
+        root[4] = [0.0, *self.engine.row(m.velocity)]
+        return Prior((name,), np.array([m.time, 0.0, 0.0, 0.0, 0.0]), root)
 
     # ------------------------------------------------------------------------------------------------ quiet stretches
 
@@ -670,7 +740,7 @@ class Search:
         nodes = self._nodes(near, new)
         fitted = False
         for _ in range(_MOST_PER_GROWTH):
-            test = burn_test(fit, arc, nodes, _LONGEST * self.period, self.shared)
+            test = burn_test(fit, arc, nodes, _LONGEST * self.period, self.shared, self.engine)
             self.looks += 1
             if test.p_value > _DOUBT and fitted:
                 break
@@ -681,7 +751,7 @@ class Search:
             plain = _criterion(fit, self.shared)
             self._names += 1
             tried = _steps_of(fit, steps)
-            tried[f"{FAMILY}:{self._names}"] = test.best
+            tried[f"{FAMILY}:{self._names}"] = self.engined(test.best)
             options = [self._scored(tried, fit, arc, low, high)]
             close = options[0][1].square / options[0][1].degrees < 2.0 * self.level
             late = [n for n, m in steps.items() if near - 0.2 * self.period < m.time < new + 0.2 * self.period]
@@ -689,9 +759,10 @@ class Search:
                 name = max(late, key=lambda n: steps[n].time * direction)
                 rest = {n: m for n, m in _steps_of(fit, steps).items() if n != name}
                 without, arc2 = self.fit(low, high, arc.start, _state(fit, arc), fit.values, rest, iterations=0)
-                moved = burn_test(without, arc2, nodes, _LONGEST * self.period, self.shared)
+                moved = burn_test(without, arc2, nodes, _LONGEST * self.period, self.shared,
+                                  self.engine)
                 if moved.gain.max(initial=0.0) > 0:
-                    options.append(self._scored({**rest, name: moved.best}, without, arc2, low, high))
+                    options.append(self._scored({**rest, name: self.engined(moved.best)}, without, arc2, low, high))
             best = min(options, key=lambda o: o[0])
             if best[0] > plain - 10.0:
                 if not fitted:
@@ -701,6 +772,7 @@ class Search:
             fit, arc = best[1:]
             steps = {s.unknown.name: Manoeuvre.of(fit.values[s.unknown.name]) for s in arc.steps}
         fit, arc, steps = self._pruned(fit, arc, _steps_of(fit, steps), low, high)
+        self._learned(fit, steps)
         # Growth goes on over what it does not fit yet; the joint fit, which is stricter, has the last word.
         self.level = max(1.0, 0.5 * self.level + 0.5 * min(fit.square / fit.degrees, 2 * self.level))
         return fit, arc, steps
@@ -741,6 +813,11 @@ class Search:
         self.priors = declared
         fit, arc, steps, since, until = self._joined(quiet, steps, low, high, since, until)
         fit, arc, steps = self._alike(fit, arc, steps, since, until)
+        for _ in range(_PASSES):
+            before = len(steps)
+            fit, arc, steps = self._completed(fit, arc, steps, since, until)
+            if len(steps) == before:
+                break
         fit, arc, steps = self._thinned(fit, arc, steps, since, until)
         fit, arc, steps = self._parted(fit, arc, steps, since, until)
         fit, arc, steps = self._thinned(fit, arc, steps, since, until)
@@ -759,46 +836,63 @@ class Search:
         while a > ends[-1] or b < ends[1]:
             for direction in (1, -1):
                 edge = b if direction == 1 else a
-                new = edge + direction * _JOINED * self.period
+                new = edge + direction * max(_JOINED * self.period, _LONGER * (b - a))
                 new = min(new, ends[1]) if direction == 1 else max(new, ends[-1])
                 if new == edge:
                     continue
                 tried = (a, new) if direction == 1 else (new, b)
-                inside = {n: taken.get(n, m) for n, m in steps.items() if tried[0] < m.time < tried[1]}
+                inside = {n: m for n, m in {**steps, **taken}.items() if tried[0] < m.time < tried[1]}
                 self.say(f"one orbit over {(tried[1] - tried[0]) / 86400:.1f} days, {len(inside)} manoeuvres")
                 again, new_arc = self.fit(*tried, arc.start, _state(fit, arc), fit.values, inside, iterations=12,
                                           enough=1e-2)
                 if again.square / again.degrees > _BROKEN * min(self.level, _ROUGHEST):
                     ends[direction] = edge
                     continue
+                grown = again.square / again.degrees / (fit.square / fit.degrees)
                 fit, arc, taken = again, new_arc, _steps_of(again, inside)
                 a, b = tried
+                if grown > _GROWN and b - a > MONTHS * self.period:
+                    # What is wrong in the new part is put right before more is built on it.
+                    fit, arc, taken = self._completed(fit, arc, taken, a, b)
         return fit, arc, taken, a, b
+
+    def _learned(self, fit: Fit, steps: Mapping[str, Manoeuvre]) -> None:
+        """What the burns of a fit tell of the engine."""
+        sigma = self._sigmas(fit, [n for n, m in steps.items() if m.burning and _northward(m)])
+        for n, s in sigma.items():
+            m = steps[n]
+            if self.engine is not None:
+                # What the engine said of the length is not told twice.
+                known = self.engine.spread * m.duration
+                s = np.append(s[:4], 1.0 / np.sqrt(max(s[4] ** -2 - known**-2, 1e-12)))
+            self.lengths[n] = (m.velocity, m.duration, float(s[4]))
+        if self.lengths:
+            # What was said before is not forgotten where the burns of now say nothing.
+            self.engine = engine_of(*zip(*self.lengths.values(), strict=True)) or self.engine
 
     def _alike(self, fit: Fit, arc: OrbitArc, steps: dict[str, Manoeuvre], low: float, high: float,
                ) -> tuple[Fit, OrbitArc, dict[str, Manoeuvre]]:
-        """Give burns whose length was not found the length of the others.
+        """Give burns across the orbit's plane the length that the engine takes for their size.
 
-        The orbit feels the square of a burn's length, so that a fit that has come to a short one is stuck there; the
-        same engine in the same direction burns alike.
+        The orbit feels the square of a burn's length, so that a fit that has come to a short one is stuck there.
         """
-        lengths = []
-        sigma = self._sigmas(fit, steps)
-        for n, m in steps.items():
-            if m.burning and m.duration > 5 * sigma[n][4] and _northward(m):
-                lengths.append(m.duration)
-        if not lengths or float(np.median(lengths)) < 0.005 * self.period:
+        self._learned(fit, steps)
+        if self.engine is None:
             return fit, arc, steps
-        before, self.usual = self.usual, float(np.median(lengths))
-        alike = {n: replace(m, duration=self.usual)
-                 if _northward(m) and not 0.6 * self.usual < m.duration < 1.6 * self.usual else m
-                 for n, m in steps.items()}
-        again, new_arc = self.fit(low, high, arc.start, _state(fit, arc), fit.values, alike, iterations=20, enough=1e-3)
-        # Lengths that the data leave open may as well be the usual one.
-        if again.square < 1.02 * fit.square:
-            return again, new_arc, _steps_of(again, alike)
-        self.usual = before
-        return fit, arc, steps
+        self.say(f"engine of {1e3 * self.engine.acceleration:.4f} mm/s2 from {self.engine.burns} burns")
+        alike = {n: self.engined(m) for n, m in steps.items()}
+        if all(abs(alike[n].duration - m.duration) < _ALIKE * alike[n].duration or alike[n] is m
+               for n, m in steps.items()):
+            return fit, arc, steps
+        again, new_arc = self.fit(low, high, arc.start, _state(fit, arc), fit.values, alike, iterations=12, enough=5e-3)
+        return again, new_arc, _steps_of(again, alike)
+
+    def engined(self, m: Manoeuvre) -> Manoeuvre:
+        """A manoeuvre with the length that the engine takes for it, where it has one."""
+        if self.engine is None or not self.engine.made(m.velocity):
+            return m
+        length = self.engine.duration(m.velocity)
+        return replace(m, duration=length) if length > _SHORT * self.period else m
 
     def _sigmas(self, fit: Fit, names: Iterable[str]) -> dict[str, np.ndarray]:
         """Sigmas of the numbers of each manoeuvre, with the scatter and the shared errors that the fit shows."""
@@ -808,46 +902,117 @@ class Search:
     def _thinned(self, fit: Fit, arc: OrbitArc, steps: dict[str, Manoeuvre], low: float, high: float,
                  ) -> tuple[Fit, OrbitArc, dict[str, Manoeuvre]]:
         """Without the manoeuvres that are not significant together with all others, impulses where length is open."""
-        for _ in range(6):
+        for _ in range(_PASSES):
             weak = self._weak(fit, steps)
-            if not weak:
+            kept = _steps_of(fit, steps)
+            before = dict(kept)
+            for n, m in weak.items():
+                if m is not None:
+                    kept[n] = m
+                    continue
+                # Whether it was needed the revolutions around it tell.
+                again = self._around(fit, arc, kept, kept[n].time, low, high)
+                rest = {k: v for k, v in kept.items() if k != n}
+                if _criterion(again(rest)[0], self.shared) < _criterion(again(kept)[0], self.shared):
+                    kept = rest
+            if kept == before:
                 break
-            # Lengths first: they cost nothing, and a drop that proves wrong must not undo them.
-            chosen = {n: m for n, m in weak.items() if m is not None} or weak
-            kept = {n: m for n, m in {n: chosen.get(n, m) for n, m in steps.items()}.items() if m is not None}
-            again, new_arc = self.fit(low, high, arc.start, _state(fit, arc), fit.values, kept, iterations=15,
-                                      enough=1e-3)
-            if again.square / again.degrees > 2.0 * fit.square / fit.degrees:
+            joint, new_arc = self.fit(low, high, arc.start, _state(fit, arc), fit.values, kept, iterations=10,
+                                      enough=5e-3)
+            if joint.square / joint.degrees > _NEEDED * fit.square / fit.degrees:
                 break  # it was needed after all
-            fit, arc, steps = again, new_arc, _steps_of(again, kept)
+            fit, arc, steps = joint, new_arc, _steps_of(joint, kept)
         return fit, arc, steps
+
+    def _around(self, fit: Fit, arc: OrbitArc, steps: Mapping[str, Manoeuvre], time: float, low: float, high: float,
+                ) -> Callable[[Mapping[str, Manoeuvre]], tuple[Fit, OrbitArc]]:
+        """A fit of a few revolutions around a time with other manoeuvres, the calibration held at that of ``fit``."""
+        a, b = max(low, time - _BESIDE * self.period), min(high, time + _BESIDE * self.period)
+        inside = self.times[(self.times >= a) & (self.times <= b)]
+        start = float(inside[0])
+        state = arc.at(np.array([start]), fit.values)[0][0]
+
+        def again(others: Mapping[str, Manoeuvre]) -> tuple[Fit, OrbitArc]:
+            chosen = {n: m for n, m in others.items() if a - m.duration / 2 < m.time < b + m.duration / 2}
+            return self.fit(a, b, start, state, fit.values, chosen, iterations=8, enough=3e-3,
+                            only=[arc.position.name, arc.velocity.name, *chosen])
+
+        return again
 
     def _parted(self, fit: Fit, arc: OrbitArc, steps: dict[str, Manoeuvre], low: float, high: float,
                 ) -> tuple[Fit, OrbitArc, dict[str, Manoeuvre]]:
         """One manoeuvre in place of neighbours that the data cannot tell apart, where one explains as much."""
-        tried: set[tuple[str, ...]] = set()
-        while True:
-            sigma = self._sigmas(fit, steps)
-            # Of two that are both sure in some direction each is needed, however near they are.
-            unsure = {n for n, m in steps.items() if np.all(np.abs(m.velocity) < _SURE * sigma[n][1:4])}
-            pairs = [p for p in neighbours(steps, {n: float(s[0]) for n, s in sigma.items()}, self.times)
-                     if p not in tried and unsure & set(p)]
-            if not pairs:
-                return fit, arc, steps
-            pair = pairs[0]
-            tried.add(pair)
-            best: tuple[float, Fit, OrbitArc, dict[str, Manoeuvre]] | None = None
+        steps, before = _steps_of(fit, steps), set(steps)
+        sigma = self._sigmas(fit, steps)
+        # Of two that are both sure in some direction each is needed, however near they are.
+        unsure = {n for n, m in steps.items() if np.all(np.abs(m.velocity) < _SURE * sigma[n][1:4])}
+        for pair in neighbours(steps, {n: float(s[0]) for n, s in sigma.items()}, self.times):
+            if not unsure & set(pair) or not set(pair) <= set(steps):
+                continue
+            again = self._around(fit, arc, steps, steps[pair[0]].time, low, high)
+            best, kept = _criterion(again(steps)[0], self.shared), steps
             total = sum((steps[n].velocity for n in pair), np.zeros(3))
             for n in pair:
                 # The one may stand where either of them stood.
-                rest = {k: m for k, m in _steps_of(fit, steps).items() if k not in pair}
-                rest[n] = replace(steps[n], velocity=total)
-                score, again, new_arc = self._scored(rest, fit, arc, low, high)
-                if best is None or score < best[0]:
-                    best = score, again, new_arc, _steps_of(again, rest)
-            assert best is not None
-            if best[0] < _criterion(fit, self.shared):
-                fit, arc, steps = best[1:]
+                rest = {k: m for k, m in steps.items() if k not in pair}
+                rest[n] = self.engined(replace(steps[n], velocity=total))
+                one = again(rest)[0]
+                if _criterion(one, self.shared) < best:
+                    best, kept = _criterion(one, self.shared), {**rest, n: Manoeuvre.of(one.values[n])}
+            steps = kept
+        if set(steps) == before:
+            return fit, arc, steps
+        again_, new_arc = self.fit(low, high, arc.start, _state(fit, arc), fit.values, steps, iterations=12,
+                                   enough=1e-3)
+        return again_, new_arc, _steps_of(again_, steps)
+
+    def _completed(self, fit: Fit, arc: OrbitArc, steps: dict[str, Manoeuvre], low: float, high: float,
+                   ) -> tuple[Fit, OrbitArc, dict[str, Manoeuvre]]:
+        """With the manoeuvres that show only beside others: a burn that was taken for a part of another one.
+
+        Where the joint fit leaves much more than elsewhere, the growth's test is made once more, with the orbit on
+        both sides known.
+        """
+        steps, before = _steps_of(fit, steps), set(steps)
+        turn = np.floor((fit.time - low) / (0.5 * self.period)).astype(int)
+        square = np.bincount(turn, fit.residual**2) / np.maximum(np.bincount(turn), 1)
+        usual = float(np.median(square[square > 0]))
+        loud = [k for k in np.argsort(-square) if square[k] > _LOUD * usual][:_MOST_COMPLETED]
+        places: list[tuple[float, str]] = [(low + (k + 0.5) * 0.5 * self.period, "") for k in loud]
+        if self.engine is not None:
+            merged = [n for n, m in steps.items() if self.engine.made(m.velocity) and self.engine.leaves(m.velocity)]
+            places = [*((steps[n].time, n) for n in merged), *places]
+        for middle, left in places:
+            again = self._around(fit, arc, steps, middle, low, high)
+            local, local_arc = again(steps)
+            plain, alone = _criterion(local, self.shared), steps
+            now = {**steps, **_steps_of(local, {n: steps[n] for n in steps if n in local.values})}
+            if left:
+                assert self.engine is not None
+                axis = self.engine.axis(steps[left].velocity)
+                assert axis is not None
+                # The part that points where the nozzle does, and then whatever else there was.
+                alone = {**now, left: self.engined(replace(now[left], velocity=(now[left].velocity @ axis) * axis))}
+                local, local_arc = again(alone)
+                now = {**alone, **_steps_of(local, {n: alone[n] for n in alone if n in local.values})}
+            nodes = self._nodes(max(middle - 0.75 * self.period, local_arc.span[0]),
+                                min(middle + 0.75 * self.period, local_arc.span[1]))
+            test = burn_test(local, local_arc, nodes, _LONGEST * self.period, self.shared, self.engine)
+            if test.p_value > LEVEL:
+                continue
+            self._names += 1
+            name = f"{FAMILY}:{self._names}"
+            best = self.engined(test.best)
+            more = again({**now, name: best})[0]
+            if _criterion(more, self.shared) < plain - 10.0:
+                steps = _steps_of(more, {**now, name: best})
+        if set(steps) == before:
+            return fit, arc, steps
+        again_, new_arc = self.fit(low, high, arc.start, _state(fit, arc), fit.values, steps, iterations=12,
+                                   enough=1e-3)
+        if again_.square > fit.square:
+            return fit, arc, {n: m for n, m in steps.items() if n in before}
+        return again_, new_arc, _steps_of(again_, steps)
 
     def p_values(self, fit: Fit, names: Sequence[str]) -> dict[str, float]:
         """Probability of each manoeuvre's velocity without one, over all places where the search looked."""
@@ -874,7 +1039,7 @@ class Search:
         # Of an orbit that does not fit yet no length of a burn can be told.
         fitted = fit.square / fit.degrees < 25.0 * self.level
         for n, m in steps.items():
-            if not (fitted and m.burning) or n in found:
+            if not (fitted and m.burning) or n in found or (self.engine is not None and self.engine.made(m.velocity)):
                 continue
             if m.duration < 3 * np.sqrt(covariance[fit.columns(n)][4] * scale):
                 found[n] = replace(m, duration=0.0)
