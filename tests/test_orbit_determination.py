@@ -28,6 +28,7 @@ from problems.geo_orbit.initial_orbit import initial_state
 from problems.geo_orbit.plausibility import kepler
 from problems.geo_orbit.problem import OrbitModel, orbit_model, orbit_problem
 from problems.geo_orbit.settings import OrbitSettings, settings_from
+from problems.geo_orbit.simulator import simulated_tracking
 from problems.geo_orbit.solution import OrbitSolution, solve_tracking
 from problems.geo_orbit.tracking import Observations, Station, Tracking
 from problems.readers.tracking_ccsds import Ephemeris, read_oem, read_tdm, write_oem, write_tdm
@@ -70,33 +71,7 @@ def generated(
     noise: bool = True,
 ) -> Tracking:
     """Measurements of the settings' own orbit wherever a station sees it, with declared noise and given effects."""
-    epoch = tai_from_utc([EPOCH])[0]
-    time = np.arange(300.0, hours * 3600, 420.0)
-    bare = []
-    for i, name in enumerate(STATIONS):
-        for kind, size, shift in (("range", 1, 0), ("azimuth_elevation", 2, 100)):
-            t = time + 37.0 * i + shift
-            tai = epoch + np.round(t * 1e6).astype("timedelta64[us]")
-            value = np.full((len(t), size), 4e7 if kind == "range" else 0.5)
-            bare.append(Observations(kind, name, name, tai, value))  # type: ignore[arg-type]
-    model = OrbitModel(Tracking(tuple(bare)), chosen, epoch, np.array(POSITION), np.array(VELOCITY))
-    from problems.geo_orbit.plausibility import predicted_elevations
-
-    up = {name: e > np.radians(8) for name, (_, e) in predicted_elevations(model).items()}
-    model = model.thinned(up)
-    problem = orbit_problem(model, list(effects or {}))
-    values = {**problem.start, **(effects or {})}
-    random = np.random.default_rng(seed)
-    seen = []
-    for o, residual in zip(model.tracking.observations, problem.residuals, strict=True):
-        assert isinstance(residual, KernelResidual)
-        predicted = o.value - residual.linearize(values).residual
-        error = random.standard_normal(predicted.shape) * residual.standard_deviation if noise else 0.0
-        value = predicted + error
-        if o.kind == "azimuth_elevation":
-            value[:, 0] = np.mod(value[:, 0], 2 * np.pi)
-        seen.append(replace(o, value=value))
-    return Tracking(tuple(seen))
+    return replace(simulated_tracking(chosen, hours=hours, effects=effects, seed=seed if noise else None), stations={})
 
 
 @pytest.fixture(scope="module")
