@@ -277,7 +277,8 @@ class OrbitArc:
     def at(self, times: np.ndarray, values: Values) -> tuple[np.ndarray, np.ndarray]:
         """States (n, 6) and derivatives (n, 6, columns) at ``times`` (n,), s; the later side at a velocity step.
 
-        Stations that measure at the same instants ask for the same states: what was computed at the same values is kept.
+        Stations that measure at the same instants ask for the same states: what was computed at the same values is
+        kept.
         """
         times = np.asarray(times, dtype=float)
         segments = sorted(self.segments(values), key=lambda s: s.low)

@@ -115,6 +115,7 @@ class _Proof:
         p_value: after the search, with errors that measurements share taken into account.
         fitted, held_out: root mean square (m or the channel's unit) by channel, without and with the effect.
         ratio: the same over the declared noise: fitted without, with; held out without, with.
+        helps: whether held-out data, each over what is expected of it, are better with the effect.
     """
 
     score: float
@@ -122,6 +123,7 @@ class _Proof:
     fitted: dict[str, tuple[float, float]]
     held_out: dict[str, tuple[float, float]]
     ratio: tuple[float, float, float, float]
+    helps: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -662,11 +664,8 @@ def _concluded(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], furt
     unproved = [n for n in further if n not in proved] if first else []
     weak = set()
     for e in answer.effects:
-        if e.name.startswith(FAMILY):
-            sizes = [e.parameters[k] for k in ("radial", "along", "cross")]
-            none = all(abs(v["value"]) < _SURE * v["sigma"] for v in sizes)
-            if e.proof.p_value > LEVEL or (none and not _held(e)):
-                weak.add(e.name)
+        if e.name.startswith(FAMILY) and (e.proof.p_value > LEVEL or (_nothing(e) and not _held(e))):
+            weak.add(e.name)
     if not unproved and not weak:
         return answer
     kept = [(n, m) for k, (n, m) in enumerate(zip(found.names, found.manoeuvres, strict=True))
@@ -681,9 +680,15 @@ def _concluded(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], furt
     return replace(again, rejected=tuple(f"{n} makes the held-out passes no better" for n in unproved))
 
 
+def _nothing(e: KeptEffect) -> bool:
+    """Whether a manoeuvre is within three sigmas of zero in every direction."""
+    sizes = [e.parameters[k] for k in ("radial", "along", "cross")]
+    return all(abs(v["value"]) < _SURE * v["sigma"] for v in sizes)
+
+
 def _held(e: KeptEffect) -> bool:
     """Whether the held-out data are better with an effect than without."""
-    return any(b < a for a, b in e.proof.held_out.values())
+    return e.proof.helps or any(b < a for a, b in e.proof.held_out.values())
 
 
 def _proved(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], further: Sequence[str],
@@ -711,7 +716,9 @@ def _proved(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], further
     level = max(1.0, fit.square / fit.degrees) * max(found.shared, structure)
     spread = np.sqrt(np.diag(covariance) * level)
     places = (last - first) / found.search.period * 48
-    expected = _expected(held, covariance / np.outer(fit.scales, fit.scales) * level)
+    spread_held = _spread(held, covariance / np.outer(fit.scales, fit.scales) * level)
+    expected = {str(c): float(np.sqrt(np.mean((held.residual / spread_held)[held.channel == c] ** 2)))
+                for c in dict.fromkeys(held.channel)}
     effects = []
 
     def proved(columns: list[int], fixed: list[int], values: np.ndarray, looks: float) -> _Proof:
@@ -726,7 +733,10 @@ def _proved(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], further
         p = float(min(1.0, looks * chi2.sf(score / level, len(columns))))
         return _Proof(score, p, {k: (v, after[k]) for k, v in fitted.items()},
                       {k: (v, held_after[k]) for k, v in held_out.items()},
-                      (ratio, ratio_after, held_before, held_ratio))
+                      (ratio, ratio_after, held_before, held_ratio),
+                      # A few passes beside burns, predicted worst, must not decide for all others.
+                      bool(np.sum(((held.residual + held.jacobian @ change) / spread_held) ** 2)
+                           > np.sum((held.residual / spread_held) ** 2)))
 
     labels, units = ("time", "radial", "along", "cross", "duration"), ("s", "m/s", "m/s", "m/s", "s")
     steps = {n: Manoeuvre.of(fit.values[n]) for n in found.names}
@@ -775,7 +785,8 @@ def _proved(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], further
             group = (e.name, *(n for n in together if n != e.name))
             columns = [k for n in together for k in range(fit.columns(n).start, fit.columns(n).stop)]
             proof = proved(columns, [], np.concatenate([np.atleast_1d(fit.values[n]) for n in together]), len(every))
-        if proof.p_value > LEVEL or not any(b < a for a, b in proof.held_out.values()):
+        better = proof.helps or any(b < a for a, b in proof.held_out.values())
+        if proof.p_value > LEVEL or not better:
             continue
         effects.append(KeptEffect(e.name, group, parameters, proof, "", e.reference))
     effects.sort(key=lambda e: -e.proof.score)
@@ -788,11 +799,9 @@ def _proved(model: OrbitModel, found: Found, own: Sequence[OrbitEffect], further
                            "unknown", "", 0.0, expected=expected)
 
 
-def _expected(held: _Rows, covariance: np.ndarray) -> dict[str, float]:
-    """How far held-out rows miss the fit over what its covariance (scaled unknowns) and the noise let expect, RMS."""
-    spread = np.sqrt(1.0 + np.einsum("ij,jk,ik->i", held.jacobian, covariance, held.jacobian))
-    return {str(c): float(np.sqrt(np.mean((held.residual / spread)[held.channel == c] ** 2)))
-            for c in dict.fromkeys(held.channel)}
+def _spread(rows: _Rows, covariance: np.ndarray) -> np.ndarray:
+    """Sigma (n,) of how far rows that were not fitted miss: their noise of one and the fit's covariance (scaled)."""
+    return np.asarray(np.sqrt(1.0 + np.einsum("ij,jk,ik->i", rows.jacobian, covariance, rows.jacobian)))
 
 
 def _told_together(fit: Fit, steps: dict[str, Manoeuvre], spread: np.ndarray, found: Found) -> list[list[str]]:
@@ -849,6 +858,8 @@ def _verdict(answer: KeptExplanation, noise: dict[str, float]) -> tuple[str, str
     groups = dict.fromkeys(tuple(sorted(e.group)) for e in effects if not e.name.startswith(FAMILY))
     others = ", ".join(" or ".join(g) for g in groups)
     missing = f"{manoeuvres} manoeuvres" if manoeuvres > 1 else "one manoeuvre"
+    unsure = sum(_nothing(e) for e in effects if e.name.startswith(FAMILY))
+    missing += f" ({unsure} of them within three sigmas of zero)" if unsure else ""
     missing += f" and {others}" if others else ""
     over = answer.expected
     left = "; ".join(f"{a:.3g} {u} RMS in {c.replace('_', ' ')} ({b:.3g} {u} in data no fit has seen, "

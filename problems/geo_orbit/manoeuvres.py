@@ -349,7 +349,7 @@ def turned(position: np.ndarray, velocity: np.ndarray, by: np.ndarray, faster: n
 
 def _least_squares(rows: np.ndarray, right: np.ndarray) -> np.ndarray:
     # With the right side as a further column there is no need of the orthonormal rows themselves.
-    upper = np.linalg.qr(np.column_stack([rows, right]), mode="r")
+    upper = np.asarray(np.linalg.qr(np.column_stack([rows, right]), mode="r"))
     n = rows.shape[1]
     return np.asarray(solve_triangular(upper[:n, :n], upper[:n, n]))
 
@@ -814,9 +814,9 @@ class Search:
         fit, arc, steps, since, until = self._joined(quiet, steps, low, high, since, until)
         fit, arc, steps = self._alike(fit, arc, steps, since, until)
         for _ in range(_PASSES):
-            before = len(steps)
+            count = len(steps)
             fit, arc, steps = self._completed(fit, arc, steps, since, until)
-            if len(steps) == before:
+            if len(steps) == count:
                 break
         fit, arc, steps = self._thinned(fit, arc, steps, since, until)
         fit, arc, steps = self._parted(fit, arc, steps, since, until)
@@ -977,7 +977,9 @@ class Search:
         turn = np.floor((fit.time - low) / (0.5 * self.period)).astype(int)
         square = np.bincount(turn, fit.residual**2) / np.maximum(np.bincount(turn), 1)
         usual = float(np.median(square[square > 0]))
-        loud = [k for k in np.argsort(-square) if square[k] > _LOUD * usual][:_MOST_COMPLETED]
+        # Below the noise of quiet data there is no manoeuvre to be found.
+        limit = _LOUD * max(usual, 1.0)
+        loud = [k for k in np.argsort(-square) if square[k] > limit][:_MOST_COMPLETED]
         places: list[tuple[float, str]] = [(low + (k + 0.5) * 0.5 * self.period, "") for k in loud]
         if self.engine is not None:
             merged = [n for n, m in steps.items() if self.engine.made(m.velocity) and self.engine.leaves(m.velocity)]
@@ -998,7 +1000,7 @@ class Search:
             nodes = self._nodes(max(middle - 0.75 * self.period, local_arc.span[0]),
                                 min(middle + 0.75 * self.period, local_arc.span[1]))
             test = burn_test(local, local_arc, nodes, _LONGEST * self.period, self.shared, self.engine)
-            if test.p_value > LEVEL:
+            if test.p_value > _DOUBT:
                 continue
             self._names += 1
             name = f"{FAMILY}:{self._names}"
