@@ -17,7 +17,7 @@ from estimator.orbit_signal import OrbitArc, VelocityStep, position_unknown, vel
 from estimator.residuals import KernelResidual
 from estimator.unknowns import Unknown, Vector
 from problems.geo_orbit.kept_orbit import KeptExplanation, consistent, explained_kept
-from problems.geo_orbit.manoeuvres import Manoeuvre, neighbours
+from problems.geo_orbit.manoeuvres import Manoeuvre, _least_squares, neighbours
 from problems.geo_orbit.problem import OrbitModel, orbit_model, orbit_problem
 from problems.geo_orbit.settings import settings_from
 from problems.geo_orbit.tracking import Observations, Station, Tracking
@@ -209,3 +209,17 @@ def test_a_name_is_believed_where_successive_arcs_agree() -> None:
     believed, rejected = consistent([{"x": offer(1.0, 0.1)}, {}], arcs)
     assert not believed and "one arc of 2 alone" in rejected[0]
     assert consistent([{"x": offer(1.0, 0.1)}], arcs[:1]) == (("x",), ())
+
+
+def test_a_number_that_no_row_tells_gets_no_step() -> None:
+    draw = np.random.default_rng(2)
+    rows = draw.standard_normal((30, 5))
+    right = draw.standard_normal(30)
+    full = _least_squares(rows, right)
+    np.testing.assert_allclose(full, np.linalg.lstsq(rows, right, rcond=None)[0], rtol=1e-10)
+    silent = rows.copy()
+    silent[:, 2] = 0.0
+    step = _least_squares(silent, right)
+    assert step[2] == pytest.approx(0.0, abs=1e-12)
+    others = [0, 1, 3, 4]
+    np.testing.assert_allclose(step[others], _least_squares(rows[:, others], right), rtol=1e-8)

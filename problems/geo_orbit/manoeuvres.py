@@ -351,6 +351,10 @@ def _least_squares(rows: np.ndarray, right: np.ndarray) -> np.ndarray:
     # With the right side as a further column there is no need of the orthonormal rows themselves.
     upper = np.asarray(np.linalg.qr(np.column_stack([rows, right]), mode="r"))
     n = rows.shape[1]
+    size = np.linalg.norm(upper[:, :n], axis=0)
+    if len(upper) < n or np.any(np.abs(np.diag(upper)[:n]) <= 1e-14 * size):
+        # What the rows do not tell gets no step.
+        return np.asarray(np.linalg.lstsq(upper[:, :n], upper[:, n], rcond=None)[0])
     return np.asarray(solve_triangular(upper[:n, :n], upper[:n, n]))
 
 
