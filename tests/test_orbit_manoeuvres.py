@@ -220,6 +220,6 @@ def test_a_number_that_no_row_tells_gets_no_step() -> None:
     silent = rows.copy()
     silent[:, 2] = 0.0
     step = _least_squares(silent, right)
-    assert step[2] == pytest.approx(0.0, abs=1e-12)
+    assert abs(step[2]) < 1e-12
     others = [0, 1, 3, 4]
     np.testing.assert_allclose(step[others], _least_squares(rows[:, others], right), rtol=1e-8)
