@@ -24,7 +24,7 @@ from estimator.residuals import KernelResidual
 from problems.geo_orbit.explanation import explained
 from problems.geo_orbit.initial_orbit import state_of_elements
 from problems.geo_orbit.kept_orbit import KeptExplanation
-from problems.geo_orbit.manoeuvres import FAMILY, Fit
+from problems.geo_orbit.manoeuvres import FAMILY, Fit, common_error
 from problems.readers.tracking_files import read_files
 
 ROOT = Path(__file__).parents[1]
@@ -93,7 +93,7 @@ def held_to_elements(answer: KeptExplanation, path: Path) -> dict[str, float]:
     if all(u.name != SCALE for u in fit.unknowns):
         return {}
     there = differences(answer, [fit], path)
-    covariance = fit.covariance() * max(1.0, fit.square / fit.degrees) * answer.found.shared
+    covariance = fit.covariance() * max(1.0, fit.square / fit.degrees) * max(answer.found.shared, common_error(fit))
     x, y = fit.values["position"][:2]
     longitude = np.zeros(len(covariance))
     longitude[fit.columns("position")] = np.array([-y, x, 0.0]) / (x * x + y * y)
