@@ -13,7 +13,7 @@ from scipy.stats import binom, chi2
 
 from estimator.discrepancy.false_alarm import Looks, after_search, counted_looks
 from estimator.discrepancy.gap import find_gap
-from estimator.discrepancy.proof import _prediction, misfit, pays, shifts
+from estimator.discrepancy.proof import _prediction, misfit, proved, shifts
 from estimator.discrepancy.score import (
     Signature,
     Stack,
@@ -383,7 +383,7 @@ def test_an_addition_pays_where_held_out_samples_bear_it_out() -> None:
         measured[:, 1] += curve
         plain = solve(problem_of(time, measured, 0.1, accepted=used))
         bent = solve(problem_of(time, measured, 0.1, curved=True, accepted=used).freeing("candidate"))
-        return pays(plain, bent, ("doppler",))
+        return not proved(plain, bent, ("doppler",)).refuted
 
     assert verdict(0.5 * time**2)
     assert not verdict(np.where(used, 0.5 * time**2, -1.0))

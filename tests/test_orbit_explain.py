@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,10 @@ from problems.geo_orbit.commands import app
 from problems.geo_orbit.explanation import OrbitExplanation, explained
 from problems.geo_orbit.settings import OrbitSettings, settings_from
 from problems.geo_orbit.simulator import simulated_tracking
+from problems.readers.tracking_files import read_files
+
+W3B = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "geo-w3b"
+needs_w3b = pytest.mark.skipif(not W3B.exists(), reason="the W3B tracking data are not beside the repository")
 
 HIDDEN = [
     ("transfer", "constant-acceleration", (4e-7, -3e-7, 5e-7)),
@@ -138,3 +143,14 @@ def test_simulate_then_explain_on_the_command_line(tmp_path: Path) -> None:
     asked = runner.invoke(app, ["explain", str(data), str(settings), "--json"])
     answer = json.loads(asked.stdout)
     assert [e["group"] for e in answer["effects"] if "timetag-offset:East" in e["group"]], answer["why"]
+
+
+@needs_w3b
+def test_real_tracking_is_explained_and_without_the_acceleration_its_name_is_found() -> None:
+    """Eutelsat W3B: quiet with the published model; the small acceleration taken out is found again."""
+    tracking, settings = read_files([W3B / "W3B.aer", *sorted(W3B.glob("bulletinb-*.txt"))],
+                                    Path(__file__).resolve().parents[1] / "examples" / "w3b.toml")
+    assert explained(tracking, settings).findings.verdict == "quiet"
+    found = explained(tracking, replace(settings, acceleration=None)).findings
+    assert found.verdict == "ambiguous"
+    assert [f.group for f in found.findings] == [("constant-acceleration", "constant-acceleration:orbital")]

@@ -186,7 +186,7 @@ def _kernel_cells(residual: KernelResidual, part: Linearization, stacked: Stack,
         phase = 2 * (time - start) / max(stop - start, 1e-9) - 1
         smooth = np.linalg.qr(legvander(phase, SMOOTH - 1))[0]
         for component in range(width):
-            if _below(part.whitened[inside, component] / stacked.scale[residual.name]):
+            if below_noise(part.whitened[inside, component] / stacked.scale[residual.name]):
                 continue
             at = inside * width + component
             inner = piece.inner.T @ (piece.span[at].T @ smooth)
@@ -200,7 +200,7 @@ def _kernel_cells(residual: KernelResidual, part: Linearization, stacked: Stack,
     return cells
 
 
-def _below(whitened: np.ndarray) -> bool:
+def below_noise(whitened: np.ndarray) -> bool:
     """Whether residuals (n,) stay clearly below the declared noise, structure and all: the model explains them then."""
     return len(whitened) > 0 and float(np.mean(whitened**2)) < 1 - 2 * float(np.sqrt(2 / len(whitened)))
 
@@ -230,7 +230,7 @@ def _position_cells(residual: TrajectoryResidual, part: Linearization) -> list[_
         phase = 2 * (time[inside] - start) / max(stop - start, 1e-9) - 1
         smooth = np.linalg.qr(legvander(phase, SMOOTH - 1))[0]
         for axis in range(3):
-            if _below(whitened[inside, axis]):
+            if below_noise(whitened[inside, axis]):
                 continue
             amounts = smooth.T @ whitened[inside, axis]
             statistic = float(amounts @ amounts)
@@ -275,7 +275,7 @@ def _serial_cells(residual: object, part: Linearization, scale: float) -> list[_
     cells = []
     for component in range(series.shape[1]):
         x = series[:, component]
-        if _below(x):
+        if below_noise(x):
             continue
         spread = max(float(np.mean(x**2)), 1.0)  # what stays below the declared noise is no gap, however smooth
         product = float(np.sum(x[1:][pairs] * x[:-1][pairs]))
@@ -329,7 +329,7 @@ def _periodic_cells(problem: Problem, parts: Sequence[Linearization], stacked: S
         for i, (_, time, whitened, _) in enumerate(arcs):
             place = np.rint((time - time[0]) / step).astype(int)
             for k in range(components):
-                if _below(whitened[:, k]):
+                if below_noise(whitened[:, k]):
                     continue
                 level = max(float(np.mean(whitened[:, k] ** 2)), 1.0)
                 spread = np.bincount(place, whitened[:, k], minlength=bins)

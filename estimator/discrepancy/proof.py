@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from estimator.discrepancy.gap import below_noise
 from estimator.estimate import Estimate
 from estimator.problem import Problem, normal_equations, offsets
 from estimator.residuals import KernelResidual, Linearization, Residual
@@ -120,23 +121,48 @@ def _prediction(estimate: Estimate, channels: Collection[str], names: Collection
     return _Prediction(_held_out(estimate, channels, names), columns, (basis / eigenvalues[kept]) @ basis.T)
 
 
-def pays(before: Estimate, after: Estimate, channels: Collection[str]) -> bool:
-    """Whether the held-out samples of the channels that an effect changes bear the effect out.
+@dataclass(frozen=True)
+class Proof:
+    """What the held-out samples say about an effect.
+
+    Attributes:
+        drop: of their weighed sum of squares by the effect, at the size that the fit gave it.
+        change: squared length of the change that the effect makes to them, in the same measure.
+    """
+
+    drop: float
+    change: float
+
+    @property
+    def refuted(self) -> bool:
+        """Whether the sum rises although that is improbable (0.1 %) if the effect is real.
+
+        It then drops by ``change`` give or take twice its root. The fitted size errs: up to an eighth of the change of
+        such error is allowed for, which takes a quarter of the drop.
+        """
+        return self.drop <= 0 and self.drop <= 0.75 * self.change - 3.09 * 2 * float(np.sqrt(self.change))
+
+
+def proved(before: Estimate, after: Estimate, channels: Collection[str]) -> Proof:
+    """What the held-out samples of the channels that an effect changes say about it.
 
     The misses are weighed by the covariance of the prediction without the effect, that of the noise and of the fit
-    together: the state that is carried on to the held-out end of an arc may err by more than its samples' noise. With
-    ``d`` the length of the change that the effect makes to the held-out samples in that measure, their sum of squares
-    drops by ``d^2`` give or take ``2 d`` if the effect is real and its size is known. The fitted size errs: up to an
-    eighth of ``d^2`` of such error is allowed for, which takes a quarter of the drop. An addition is refused when the
-    sum rises although that is improbable (0.1 %) even so.
+    together: the state that is carried on to the held-out end of an arc may err by more than its samples' noise.
     """
     names = {r.name for r in before.problem.residuals} & {r.name for r in after.problem.residuals}
     first = _prediction(before, channels, names)
     missed = _held_out(after, channels, names)
     moved = first.miss - missed
-    drop = first.product(first.miss, first.miss) - first.product(missed, missed)
-    change = first.product(moved, moved)
-    return drop > 0 or drop > 0.75 * change - 3.09 * 2 * float(np.sqrt(max(change, 0.0)))
+    return Proof(first.product(first.miss, first.miss) - first.product(missed, missed),
+                 max(first.product(moved, moved), 0.0))
+
+
+def nothing_to_explain(estimate: Estimate, channels: Collection[str]) -> bool:
+    """Whether the fitted samples of the channels stay clearly below their declared noise: an effect that lowers them
+    further explains what was declared to be noise."""
+    return below_noise(np.concatenate([np.zeros(0), *(
+        _samples(r, p, False)[0].ravel() for r, p in zip(estimate.problem.residuals, estimate.parts, strict=True)
+        if r.channel in channels)]))
 
 
 def channels_of(problem: Problem, name: str) -> tuple[str, ...]:

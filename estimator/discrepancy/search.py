@@ -21,7 +21,7 @@ from estimator.chance import chi2_tail
 from estimator.discrepancy.combinations import Candidate, LinearLibrary, price, visible_directions
 from estimator.discrepancy.false_alarm import Looks, counted_looks
 from estimator.discrepancy.gap import Gap, find_gap
-from estimator.discrepancy.proof import HeldOut, channels_of, misfit, pays, shifts
+from estimator.discrepancy.proof import HeldOut, channels_of, misfit, nothing_to_explain, proved, shifts
 from estimator.discrepancy.score import (
     Score,
     Signature,
@@ -41,6 +41,7 @@ from estimator.solvers.gauss_newton import Options, solve
 from estimator.solvers.summary import summarized
 
 SIGNIFICANT = 0.008  # probability of a name where there is nothing, after the search
+BEYOND_DOUBT = 1e-5  # the same where the residuals stay below a noise that was declared too large
 MOST_EFFECTS = 6
 INDISTINGUISHABLE = 4.6  # log odds (100 to 1) below which two names explain the data equally well
 TRIED_SETTINGS = 6  # settings of a searched parameter that take part in sets
@@ -665,10 +666,17 @@ class Workflow:
         return tuple(here.library.candidates[i].name for i in order)
 
     def _pays(self, effects: tuple[str, ...], name: str) -> bool:
-        """Whether held-out data bear out one of the effects beside the others."""
-        near = self.fit(effects)
-        second, first = near.estimate, self.fit([n for n in effects if n != name], near).estimate
-        return pays(first, second, channels_of(second.problem, name))
+        """Whether held-out data bear out one of the effects beside the others.
+
+        What they take back of the evidence must leave it significant.
+        """
+        second = self.fit(effects)
+        first = self.fit([n for n in effects if n != name], second)
+        channels = channels_of(second.estimate.problem, name)
+        proof = proved(first.estimate, second.estimate, channels)
+        drop = first.cost - second.cost + min(proof.drop, 0.0)
+        level = BEYOND_DOUBT if nothing_to_explain(first.estimate, channels) else SIGNIFICANT
+        return not proof.refuted and self.significant(drop, name) < level
 
     def _findings(self, order: tuple[str, ...], excluded: Collection[str]) -> tuple[Finding, ...]:
         findings = []
