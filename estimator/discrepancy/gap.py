@@ -25,6 +25,7 @@ from estimator.trajectory_residual import TrajectoryResidual
 SMOOTH = 8  # Legendre polynomials per arc and component
 LONGEST_PIECE = 2048  # samples of a stretch of positions in one periodogram
 LEVEL = 0.002  # probability of a gap where there is none, over all places together
+BETWEEN = "between arcs"  # how stretches of positions without a known attitude are called
 
 
 @dataclass(frozen=True)
@@ -139,10 +140,16 @@ def find_gap(problem: Problem, stacked: Stack, parts: Sequence[Linearization]) -
 
 
 def _together(cells: Sequence[_Cell]) -> list[_Cell]:
-    """Slow structure of all arcs of a component, and of all components: weak in each, it may be plain in the sum."""
+    """Slow structure of all arcs of a component, and of all components: weak in each, it may be plain in the sum.
+
+    Positions inside the arcs, where the attitude is known, are one sum and those between them another.
+    """
     found = []
-    for channel in dict.fromkeys(c.channel for c in cells if not c.fast):
-        mine = [c for c in cells if c.channel == channel and not c.fast]
+    families: dict[tuple[str, bool], list[_Cell]] = {}
+    for cell in cells:
+        if not cell.fast:
+            families.setdefault((cell.channel, cell.arc.startswith(BETWEEN)), []).append(cell)
+    for (channel, _), mine in families.items():
         components = sorted({c.component for c in mine})
         if len(mine) < 2:
             continue
@@ -381,7 +388,7 @@ def _marked(residual: TrajectoryResidual, used: np.ndarray) -> list[tuple[str, n
         return [(f"stretch {i + 1}", piece) for i, piece in enumerate(np.array_split(np.arange(count), 24))]
     flag = np.asarray(inside)[used] > 0
     edges = np.flatnonzero(np.diff(flag.astype(int))) + 1
-    return [(f"arc {i + 1}" if flag[piece[0]] else f"between arcs {i + 1}", piece)
+    return [(f"arc {i + 1}" if flag[piece[0]] else f"{BETWEEN} {i + 1}", piece)
             for i, piece in enumerate(np.split(np.arange(count), edges)) if len(piece)]
 
 

@@ -519,7 +519,10 @@ def _positions(model: AlignmentModel, effects: tuple[EffectInstance, ...]) -> Tr
         assert model.campaign.doppler is not None
         epochs.append((model._inside(model.campaign.doppler.time[model.doppler_epochs]), 1))
     directions = felt_directions(model.block, epochs)
-    kernel, data = None, {}
+    arcs = np.zeros(len(gnss.time), dtype=bool)
+    for arc in model.campaign.arcs:
+        arcs |= (gnss.time >= arc.start - 1e-6) & (gnss.time <= arc.stop + 1e-6)
+    kernel, data = None, {"inside_arc": arcs.astype(float)}  # where a disagreement is looked for, without effects too
     if any(e.channel == "gnss" for e in effects):
         kernel = position_effect_kernel(tuple(e for e in effects if e.channel == "gnss"))
         tracker = model.campaign.star_tracker
@@ -530,9 +533,6 @@ def _positions(model: AlignmentModel, effects: tuple[EffectInstance, ...]) -> Tr
         except ValueError:
             quaternion = np.tile([1.0, 0.0, 0.0, 0.0], (len(gnss.time), 1))
             rate, inside = np.zeros((len(gnss.time), 3)), np.zeros(len(gnss.time))
-        arcs = np.zeros(len(gnss.time), dtype=bool)
-        for arc in model.campaign.arcs:
-            arcs |= (gnss.time >= arc.start - 1e-6) & (gnss.time <= arc.stop + 1e-6)
         data = {"environment": model.environment(gnss.time), "attitude": quaternion, "rate": rate,
                 "inside_arc": inside * arcs}
     trajectory = trajectory_unknown(directions, displaced=kernel is not None)
