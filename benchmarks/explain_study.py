@@ -155,8 +155,9 @@ def direction(effect: Any, draw: np.random.Generator) -> np.ndarray:
     for i, p in enumerate(effect.parameters):
         if p.search is not None:
             share = draw.uniform(0.1, 0.9)
-            low, high, _, spacing = p.search  # of a frequency every octave is as likely
-            values[i] = low + (high - low) * share if spacing == "linear" else low * (high / low) ** share
+            low, high, _, spacing, _ = p.search  # of a frequency every octave is as likely
+            even = spacing in ("linear", "listed")
+            values[i] = low + (high - low) * share if even else low * (high / low) ** share
         elif p.nominal is not None:
             values[i] = p.nominal
         else:

@@ -6,6 +6,7 @@ import importlib.metadata
 import subprocess
 import sys
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import casadi as ca
@@ -16,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.effects import declaration, library
 from estimator.effects.checks import numeric, problems_of, random_sample
-from estimator.effects.declaration import Effect, EffectInstance, Layout, Parameter, Sample, declare
+from estimator.effects.declaration import Effect, EffectInstance, Layout, Parameter, Sample, Search, declare
 from estimator.effects.documentation import EXAMPLE, main, render
 from estimator.models import flexible_mode, propellant
 from estimator.models.earth import GRAVITATIONAL_PARAMETER, ROTATION_RATE
@@ -606,3 +607,29 @@ def test_the_library_costs_no_heavy_import() -> None:
 def test_instances_of_one_layout_are_the_same(name: str) -> None:
     assert SHIPPED[name].instances(EXAMPLE) == SHIPPED[name].instances(EXAMPLE)
     assert len({hash(i) for i in SHIPPED[name].instances(EXAMPLE)}) == len(SHIPPED[name].instances(EXAMPLE))
+
+
+def test_a_search_goes_through_its_values_in_even_steps_of_its_measure() -> None:
+    for search in (Search(0.01, 0.6, 13, "square-root"), Search(0.1, 10.0, 5, "logarithmic"),
+                   Search(-2.0, 4.0, 7, "linear"), Search.of([1.0, 2.0, 10.0, 11.0, 50.0])):
+        values = search.values()
+        assert len(values) == search.number and np.all(np.diff(values) > 0)
+        assert values[0] == pytest.approx(search.low) and values[-1] == pytest.approx(search.high)
+        for a, b in pairwise(values):
+            assert search.moved(float(a), 1.0) == pytest.approx(float(b), rel=1e-9)
+            assert search.moved(float(b), -1.0) == pytest.approx(float(a), rel=1e-9, abs=1e-12)
+            assert a < search.moved(float(a), 0.5) < b
+        assert search.low < search.middle() < search.high
+
+
+def test_jump_times_lie_inside_every_stretch_and_once_between_two() -> None:
+    stretches = ((0.0, 60.0), (1000.0, 1300.0), (2000.0, 2030.0))
+    layout = Layout(3, EXAMPLE.sessions, EXAMPLE.span, 5900.0, (0.0, 2030.0), tracker_stretches=stretches)
+    (jump,) = SHIPPED["tracker-frame-jump"].instances(layout)
+    search = jump.parameters[-1].search
+    assert search is not None
+    times = search.values()
+    for start, stop in stretches:
+        inside = times[(times > start) & (times < stop)]
+        assert len(inside) >= 4 and np.max(np.diff(inside)) <= 15.0
+    assert np.sum((times > 60.0) & (times < 1000.0)) == 1 and np.sum((times > 1300.0) & (times < 2000.0)) == 1

@@ -45,7 +45,8 @@ BEYOND_DOUBT = 1e-5  # the same where the residuals stay below a noise that was 
 MOST_EFFECTS = 6
 INDISTINGUISHABLE = 4.6  # log odds (100 to 1) below which two names explain the data equally well
 TRIED_SETTINGS = 6  # settings of a searched parameter that take part in sets
-REFINEMENTS = 4  # halvings of the step between settings of a searched parameter
+REFINEMENTS = 12  # halvings of the step between settings of a searched parameter, at most
+WORTH_HALVING = 0.05  # rise of the score by two halvings below which there are no more
 WORTH_REFINING = 0.5  # probability after the search below which settings between those of the grid are tried
 RIVALS = 5  # names that are refitted in the place of an accepted one
 TURNS = 16  # sets that are refitted before the search stops
@@ -287,6 +288,7 @@ class Workflow:
         signatures += [on_rows(s, base) for s in self.searched_signatures()]
         mine = [signature(base, problem, parts, self.library[n], np.asarray(point[n], dtype=float), whole=True)
                 for n in key if n in present]
+        signatures = _promising(base, stacked, signatures, mine)
         library, members, chosen = self._linear_model(base, stacked, signatures, mine)
         candidates = [signatures[i] for i in chosen if signatures[i].effect.name not in key]
         beside = products(stacked, candidates, stacked.residual[:, None])
@@ -317,9 +319,7 @@ class Workflow:
         places = found.places
         known = np.zeros(len(found.raw))  # what the accepted effects have explained already
         for s, place in zip(mine, places[len(signatures) :], strict=True):
-            ordinary = np.array([p.search is None for p in s.effect.parameters])
-            scales = np.array([p.scale for p in s.effect.parameters])
-            known[place] = np.where(ordinary, s.setting / scales, 0.0)
+            known[place] = _amounts(s)
         right = found.left @ known - found.against[:, 0]
         blocks, strength = [], []
         for s, place in zip(everything, places, strict=True):
@@ -407,7 +407,10 @@ class Workflow:
                 if parameter.search is None:
                     continue
                 step = 0.5
+                before = [-np.inf, -np.inf, value]
                 for _ in range(REFINEMENTS):
+                    if value - before[-3] < WORTH_HALVING:
+                        break
                     for sign in (-1, 1):
                         moved = setting.copy()
                         moved[index] = np.clip(parameter.search.moved(moved[index], sign * step), *parameter.plausible)
@@ -417,6 +420,7 @@ class Workflow:
                             value, setting = better, moved
                             self.searched_signatures().append(trial)
                     step /= 2
+                    before.append(value)
 
     def gap(self, effects: Sequence[str]) -> Gap:
         """Where the model with these effects and the data disagree."""
@@ -693,6 +697,39 @@ class Workflow:
                 misfit(two.problem, two.parts, held_out=False), misfit(one.problem, one.parts, held_out=True),
                 misfit(two.problem, two.parts, held_out=True), expected, shifts(one, two)))
         return tuple(findings)
+
+
+def _amounts(accepted: Signature) -> np.ndarray:
+    """Sizes of an accepted effect in the scales of its columns."""
+    ordinary = np.array([p.search is None for p in accepted.effect.parameters])
+    scales = np.array([p.scale for p in accepted.effect.parameters])
+    return np.where(ordinary, accepted.setting / scales, 0.0)
+
+
+def _promising(base: Stack, stacked: Stack, signatures: Sequence[Signature], mine: Sequence[Signature],
+               ) -> list[Signature]:
+    """The signatures but those settings of a name that explain least, both beside the accepted effects and without
+    them: the products of all settings with each other are many and needless."""
+    bare = base.residual.copy()
+    for s in mine:
+        for name, part in s.parts.items():
+            bare[base.pieces[name].rows] -= part @ _amounts(s)
+    right = np.column_stack([bare, stacked.projected(stacked.residual)])
+    absorbed = base.carried(right)
+
+    def strength(s: Signature) -> np.ndarray:
+        found = products(base, (s,), right, absorbed)
+        return np.asarray(np.sum((visible_directions(found.raw, found.left).T @ found.against) ** 2, axis=0))
+
+    kept: list[Signature] = []
+    for effect in dict.fromkeys(s.effect.name for s in signatures):
+        own = [s for s in signatures if s.effect.name == effect]
+        if len(own) > 2 * TRIED_SETTINGS:
+            drops = np.array([strength(s) for s in own])
+            best = {int(i) for column in drops.T for i in np.argsort(-column)[:TRIED_SETTINGS]}
+            own = [own[i] for i in sorted(best)]
+        kept += own
+    return kept
 
 
 def _polished(problem: Problem, names: set[str], iterations: int = 12) -> dict[str, np.ndarray]:

@@ -25,7 +25,7 @@ An effect with one instance and no states is declared and registered in one call
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -43,17 +43,31 @@ class Search(NamedTuple):
         low, high: ends of the range, in the parameter's unit.
         number: of values, both ends among them.
         spacing: in what measure the steps are even; "square-root" for a frequency, whose neighbours differ by a ratio
-            at the slow end and by the inverse of an arc's length at the fast one.
+            at the slow end and by the inverse of an arc's length at the fast one; "listed" where the values are given.
+        listed: the values, rising, of the spacing of that name.
     """
 
     low: float
     high: float
     number: int
-    spacing: Literal["linear", "logarithmic", "square-root"]
+    spacing: Literal["linear", "logarithmic", "square-root", "listed"]
+    listed: tuple[float, ...] = ()
+
+    @staticmethod
+    def of(values: Sequence[float]) -> Search:
+        """A search over these values, rising."""
+        return Search(values[0], values[-1], len(values), "listed", tuple(values))
+
+    def _measure(self) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
+        """From a value to the measure in which the steps are even, and back."""
+        if self.spacing != "listed":
+            return _SPACINGS[self.spacing]
+        places = np.arange(len(self.listed))
+        return lambda v: np.interp(v, self.listed, places), lambda m: np.interp(m, places, self.listed)
 
     def at(self, share: float | np.ndarray) -> Any:
         """The value that lies a share (0 to 1) of the range above its low end."""
-        measure, back = _SPACINGS[self.spacing]
+        measure, back = self._measure()
         return back(measure(self.low) + share * (measure(self.high) - measure(self.low)))
 
     def values(self) -> np.ndarray:
@@ -66,7 +80,7 @@ class Search(NamedTuple):
 
     def moved(self, value: float, steps: float) -> float:
         """A value moved by so many steps between neighbours."""
-        measure, back = _SPACINGS[self.spacing]
+        measure, back = self._measure()
         step = (measure(self.high) - measure(self.low)) / max(self.number - 1, 1)
         return float(back(measure(value) + steps * step))
 
@@ -109,6 +123,7 @@ class Layout:
         span: first and last time of all data, s after the epoch.
         orbital_period: s.
         tracker_span: first and last time of star tracker data, s.
+        tracker_stretches: (start, stop) of each stretch of star tracker data, s, in order; empty where not known.
         beam_directions: (beams) unit vectors in antenna axes, their mean where they vary; empty where not known.
         tracker_boresight: line of sight of the star tracker, unit vector in tracker axes.
     """
@@ -120,6 +135,7 @@ class Layout:
     tracker_span: tuple[float, float]
     beam_directions: tuple[tuple[float, float, float], ...] = ()
     tracker_boresight: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    tracker_stretches: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ def _row(parameter: Parameter) -> str:
     if parameter.nominal is not None:
         notes.append(f"physics demands {_number(parameter.nominal)}")
     if parameter.search is not None:
-        low, high, count, spacing = parameter.search
+        low, high, count, spacing = parameter.search[:4]
         notes.append(f"searched first: {count} values from {_number(low)} to {_number(high)}, {spacing}")
     low, high = parameter.plausible
     cells = (f"`{parameter.name}`", parameter.unit, _number(parameter.scale), f"{_number(low)} to {_number(high)}",

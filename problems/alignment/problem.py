@@ -291,7 +291,8 @@ class AlignmentModel:
         time = campaign.star_tracker.time
         return Layout(beams, tuple((a.start, a.stop) for a in campaign.arcs_of_kind("doppler")),
                       (float(min(campaign.gnss.time[0], time[0])), float(max(campaign.gnss.time[-1], time[-1]))),
-                      period, (float(time[0]), float(time[-1])), directions)
+                      period, (float(time[0]), float(time[-1])), directions,
+                      tracker_stretches=_stretches(campaign.arcs, time))
 
     @cached_property
     def _curves(self) -> list[AttitudeCurve]:
@@ -496,6 +497,21 @@ def alignment_problem(model: AlignmentModel, effects: Sequence[str] = (), *,
 
 def _entries(normalized: np.ndarray) -> np.ndarray:
     return entries_of(normalized / np.trace(normalized))
+
+
+def _stretches(arcs: Sequence[Arc], time: np.ndarray) -> tuple[tuple[float, float], ...]:
+    """First and last star tracker sample of each arc, in order of time; of arcs that overlap, together."""
+    found: list[tuple[float, float]] = []
+    for arc in sorted(arcs, key=lambda a: a.start):
+        inside = time[(time >= arc.start - 1e-6) & (time <= arc.stop + 1e-6)]
+        if len(inside) < 2:
+            continue
+        start, stop = float(inside[0]), float(inside[-1])
+        if found and start <= found[-1][1]:
+            found[-1] = (found[-1][0], max(stop, found[-1][1]))
+        else:
+            found.append((start, stop))
+    return tuple(found)
 
 
 def _effect_start(effect: EffectInstance) -> np.ndarray:
