@@ -379,7 +379,7 @@ def test_tracker_error_repeats_with_the_orbit_and_jumps_once(sample: dict[str, n
     assert contribution("tracker-frame-jump", before, jump) == pytest.approx(np.zeros(3), abs=1e-18)
     assert contribution("tracker-frame-jump", after, jump) == pytest.approx(jump[:3], rel=1e-12)
     at = numeric(instance("tracker-frame-jump"), EXAMPLE).along_parameters({**sample, "time": np.array(1000.02)}, jump)
-    assert np.all(at[:, 3] * jump[:3] < 0)  # later means less
+    assert np.all(at[:, 3] == 0)  # samples do not see when, only between which two of them
 
 
 # ---- radar -----------------------------------------------------------------------------------------------------------

@@ -10,15 +10,18 @@ from estimator.effects.declaration import Effect, EffectInstance, Layout, Parame
 from estimator.models.rotations import Matrix
 
 NAME = "tracker-frame-jump"
-WIDTH = 0.05  # s over which the step rises: below a tracker's cycle, yet the time keeps a derivative
 TRIALS = 48  # where the stretches of data are not known
 BETWEEN = 8.0  # s between times inside a stretch of data that are tried first: the state of an arc hides the others
 INSIDE = (4, 24)  # fewest and most of them
 
 
 def contribution(sample: Sample, p: Matrix) -> Matrix:
-    """Rotation vector (3, rad, tracker axes) of the jump ``p[:3]``, full after the time ``p[3]`` (s), zero before."""
-    return (1 + ca.tanh((sample.time - p[3]) / (2 * WIDTH))) / 2 * p[:3]
+    """Rotation vector (3, rad, tracker axes) of the jump ``p[:3]``, full after the time ``p[3]`` (s), zero before.
+
+    The time has no derivative: samples say between which two of them it lies, and a fit that followed the slope of a
+    softened step would run from there. The search finds it.
+    """
+    return ca.if_else(sample.time >= p[3], 1.0, 0.0) * p[:3]
 
 
 def _times(stretches: tuple[tuple[float, float], ...]) -> list[float]:

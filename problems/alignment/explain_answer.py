@@ -18,6 +18,7 @@ from estimator.discrepancy.gap import Gap, Place
 from estimator.discrepancy.proof import HeldOut
 from estimator.discrepancy.score import Score
 from estimator.discrepancy.search import Finding, Findings, Workflow
+from estimator.effect_uncertainty import sigma_of
 from estimator.effects.declaration import EffectInstance
 from estimator.estimate import Estimate
 
@@ -105,7 +106,7 @@ def parameters_of(estimate: Estimate, effect: EffectInstance) -> dict[str, dict[
     """Value, sigma and unit of each parameter of an effect; the sigma is None where the data do not determine it."""
     if all(u.name != effect.name for u in estimate.unknowns):
         return {}
-    values, sigma = estimate.values[effect.name], estimate.sigma_of(effect.name)
+    values, sigma = estimate.values[effect.name], sigma_of(estimate, effect)
     return {p.name: {"value": float(v), "sigma": float(s) if np.isfinite(s) else None, "unit": p.unit}
             for p, v, s in zip(effect.parameters, values, sigma, strict=True)}
 

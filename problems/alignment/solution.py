@@ -14,6 +14,7 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
+from estimator.effect_uncertainty import sigma_of
 from estimator.estimate import Estimate, Status
 from estimator.losses import Loss
 from estimator.models.errors import RequestError
@@ -154,7 +155,7 @@ class AlignmentSolution:
                 described.append({"name": instance.name, "parameters": {}})
                 continue
             values = self.estimate.values[instance.name]
-            sigma = self.estimate.sigma_of(instance.name)
+            sigma = sigma_of(self.estimate, instance)
             described.append({"name": instance.name, "parameters": {
                 p.name: {"value": float(v), "sigma": float(s), "unit": p.unit}
                 for p, v, s in zip(instance.parameters, values, sigma, strict=True)}})
