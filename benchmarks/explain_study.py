@@ -704,8 +704,9 @@ def page(result: dict[str, Any]) -> str:
     for size, one in result.get("one", {}).items():
         row(f"one effect of {size}: right", one["campaigns"], f"{_percent(one['right'])}; alone "
             f"{_percent(one['single_right'])}; median group {one['median_group'] or 0:g}")
-        row(f"one effect of {size}: no other name copies it to below {IDENTIFIABLE:g} sigma", one["identifiable"],
-            f"median group {one['median_group_identifiable'] or 0:g}")
+        if one["identifiable"]:
+            row(f"one effect of {size}: no other name copies it to below {IDENTIFIABLE:g} sigma", one["identifiable"],
+                f"median group {one['median_group_identifiable'] or 0:g}")
         row(f"one effect of {size}: another name, of these look-alikes", one["campaigns"],
             f"{_percent(one['wrong_name'])}, {_percent(one['wrong_by_a_look_alike'])}")
         row(f"one effect of {size}: no name", one["campaigns"], _percent(one["nothing"]))
