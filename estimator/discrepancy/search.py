@@ -332,7 +332,7 @@ class Workflow:
         for name in dict.fromkeys(s.effect.name for s in signatures):
             own = [i for i, s in enumerate(signatures) if s.effect.name == name]
             for k in (0, 1):
-                chosen |= set(sorted(own, key=lambda i: -strength[i][k])[:TRIED_SETTINGS])
+                chosen |= set(sorted(own, key=lambda i: (round(strength[i][k], 2), i))[-TRIED_SETTINGS:])
         kept = sorted(chosen) + list(range(len(signatures), len(everything)))
         columns = np.concatenate([np.zeros(0, dtype=int), *(np.arange(places[i].start, places[i].stop) for i in kept)])
         gram = found.left[np.ix_(columns, columns)]
@@ -726,7 +726,8 @@ def _promising(base: Stack, stacked: Stack, signatures: Sequence[Signature], min
         own = [s for s in signatures if s.effect.name == effect]
         if len(own) > 2 * TRIED_SETTINGS:
             drops = np.array([strength(s) for s in own])
-            best = {int(i) for column in drops.T for i in np.argsort(-column)[:TRIED_SETTINGS]}
+            best = {int(i) for column in drops.T
+                    for i in np.argsort(np.round(column, 2), kind="stable")[-TRIED_SETTINGS:]}
             own = [own[i] for i in sorted(best)]
         kept += own
     return kept
