@@ -28,7 +28,6 @@ import numpy as np
 
 from benchmarks.explain_study import RESULTS, results_of, strength, summary
 
-GRAVITATIONAL_PARAMETER = 3.986004418e14  # m3/s2
 ORBITS = {  # semi-major axis m, eccentricity, inclination deg, hours of data, s between measurements
     "geostationary": (42_164_170.0, 2e-4, 0.05, 36.0, 900.0),
     "transfer": (24_400_000.0, 0.72, 7.0, 14.0, 300.0),
@@ -56,7 +55,8 @@ class Case:
 
 
 def settings_of(case: Case) -> Any:
-    """Settings with the random orbit of a case: 8 x 8 gravity, Sun, Moon and sunlight."""
+    """Settings with the random orbit of a case: 8 x 8 gravity, Sun and Moon."""
+    from guidance.orbit_propagation import state_from_elements
     from problems.geo_orbit.settings import settings_from
     from problems.geo_orbit.tracking import Station
 
@@ -65,24 +65,11 @@ def settings_of(case: Case) -> Any:
     node, perigee, anomaly = draw.uniform(0, 2 * np.pi, 3)
     if case.orbit == "transfer":
         anomaly = draw.uniform(0.5 * np.pi, 1.5 * np.pi)  # away from a perigee that no station sees
-    p = a * (1 - e**2)
-    radius = p / (1 + e * np.cos(anomaly))
-    flat = radius * np.array([np.cos(anomaly), np.sin(anomaly), 0.0])
-    speed = np.sqrt(GRAVITATIONAL_PARAMETER / p) * np.array([-np.sin(anomaly), e + np.cos(anomaly), 0.0])
-
-    def about(axis: int, angle: float) -> np.ndarray:
-        c, s = np.cos(angle), np.sin(angle)
-        i, j = [(1, 2), (2, 0), (0, 1)][axis]
-        matrix = np.eye(3)
-        matrix[i, i] = matrix[j, j] = c
-        matrix[i, j], matrix[j, i] = -s, s
-        return matrix
-
-    turn = about(2, node) @ about(0, inclination) @ about(2, perigee)
+    position, velocity = state_from_elements(a, e, inclination, node, perigee, perigee + anomaly)
     tables = {
         "satellite": {"mass_kg": 2000.0, "area_m2": 30.0},
-        "orbit": {"epoch": "2023-03-10T00:00:00", "frame": "GCRF", "position_m": (turn @ flat).tolist(),
-                  "velocity_m_s": (turn @ speed).tolist()},
+        "orbit": {"epoch": "2023-03-10T00:00:00", "frame": "GCRF", "position_m": position.tolist(),
+                  "velocity_m_s": velocity.tolist()},
         "forces": {"degree": 8},
         "measurements": {"range_sigma_m": 5.0, "azimuth_sigma_deg": 0.01, "elevation_sigma_deg": 0.01},
     }
@@ -215,16 +202,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
         from problems.console import jsonable
 
         done = results_of(chosen.out)
-        todo = [c for c in cases(chosen) if c.key not in done]
+        remaining = [c for c in cases(chosen) if c.key not in done]
         chosen.out.parent.mkdir(parents=True, exist_ok=True)
         deadline = time.monotonic() + 60 * chosen.minutes
         with ProcessPoolExecutor(chosen.workers, mp_context=get_context("spawn")) as pool, chosen.out.open("a") as file:
-            for start in range(0, len(todo), 8 * chosen.workers):
+            for start in range(0, len(remaining), 8 * chosen.workers):
                 if time.monotonic() > deadline:
                     break
-                batch = [pool.submit(run, c) for c in todo[start : start + 8 * chosen.workers]]
+                batch = [pool.submit(run, c) for c in remaining[start : start + 8 * chosen.workers]]
                 for future in track(as_completed(batch), total=len(batch),
-                                    description=f"{start + len(done)} of {len(todo) + len(done)} cases"):
+                                    description=f"{start + len(done)} of {len(remaining) + len(done)} cases"):
                     file.write(json.dumps(jsonable(future.result())) + "\n")
                     file.flush()
     report(chosen.out)

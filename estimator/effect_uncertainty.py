@@ -45,8 +45,7 @@ def _interval(estimate: Estimate, name: str, index: int, plausible: tuple[float,
     ends = []
     for end in plausible:
         reach = end - at[index]
-        inside, outside = 0.0, 1.0
-        step = 2.0**-20
+        inside, step = 0.0, 2.0**-20
         while step < 1.0 and cost(float(at[index] + step * reach)) < least + 1.0:
             inside, step = step, 2 * step
         outside = min(step, 1.0)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -35,7 +36,7 @@ class Looks:
 
     def after(self, p_value: float, name: str) -> float:
         """Probability that noise makes any name as improbable, at its best setting, as this one is with ``p_value``."""
-        return after_search(after_search(p_value, self.own.get(name, 1.0)), self.names)
+        return float(after_search(after_search(p_value, self.own.get(name, 1.0)), self.names))
 
 
 def counted_looks(gram: np.ndarray, degrees: Sequence[int], places: Sequence[slice], names: Sequence[str], *,
@@ -79,7 +80,7 @@ def counted_looks(gram: np.ndarray, degrees: Sequence[int], places: Sequence[sli
     own = {name: _looks(values) for name, values in smallest.items() if list(names).count(name) > 1}
     whole = np.ones(draws)
     for name, values in smallest.items():
-        whole = np.minimum(whole, -np.expm1(own.get(name, 1.0) * np.log1p(-np.minimum(values, 1 - 1e-16))))
+        whole = np.minimum(whole, after_search(values, own.get(name, 1.0)))
     return Looks(own, _looks(whole))
 
 
@@ -88,6 +89,6 @@ def _looks(smallest: np.ndarray) -> float:
     return float(max(1.0, np.log1p(-0.02) / np.log1p(-max(level, 1e-12))))
 
 
-def after_search(p_value: float, looks: float) -> float:
+def after_search(p_value: Any, looks: float) -> Any:
     """Probability that the best of so many independent looks is as good without any effect."""
-    return float(-np.expm1(looks * np.log1p(-min(p_value, 1 - 1e-16))))
+    return -np.expm1(looks * np.log1p(-np.minimum(p_value, 1 - 1e-16)))

@@ -22,7 +22,8 @@ from problems.geo_orbit.settings import OrbitSettings
 from problems.geo_orbit.tracking import Observations, Tracking
 
 SIZES: dict[str, int] = {"range": 1, "range_rate": 1, "azimuth_elevation": 2, "direction_cosines": 2}
-_PLACEHOLDER = {"range": 4e7, "range_rate": 0.0, "azimuth_elevation": 0.5, "direction_cosines": 0.5}  # m, m/s, rad, 1
+_REFERENCE = {"range": 4e7, "range_rate": 0.0, "azimuth_elevation": 0.5, "direction_cosines": 0.5}  # m, m/s, rad, 1
+"""Values of which the kernels tell by how much the prediction differs."""
 OFFSET = 37.0  # s between the first measurements of one station and the next
 
 
@@ -72,7 +73,7 @@ def simulated_tracking(
     for i, name in enumerate(settings.stations):
         for k, kind in enumerate(kinds):
             tai = epoch + np.round((time + OFFSET * i + 100.0 * k) * 1e6).astype("timedelta64[us]")
-            bare.append(Observations(kind, name, name, tai, np.full((len(time), SIZES[kind]), _PLACEHOLDER[kind])))
+            bare.append(Observations(kind, name, name, tai, np.full((len(time), SIZES[kind]), _REFERENCE[kind])))
     model = OrbitModel(Tracking(tuple(bare)), settings, epoch, *start)
     above = {name: e > minimum_elevation for name, (_, e) in predicted_elevations(model).items()}
     if not any(np.any(a) for a in above.values()):
